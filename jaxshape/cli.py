@@ -1,0 +1,500 @@
+"""The `jaxshape` command. [host]
+
+Each subcommand is a frozen dataclass whose fields are its options and whose `run` does the work.
+Bad input ends with one sentence on standard error and exit status 2, and leaves earlier output as
+it was. JAX, and all that needs it, is imported inside `run`, so that `--help` answers at once.
+"""
+
+import json
+import os
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from tyro.conf import Positional, subcommand
+
+console = Console(stderr=True)
+
+
+@dataclass(frozen=True)
+class Search:
+    """How a shape is searched for."""
+
+    objective: Literal["balanced", "paper"] = "balanced"
+    """Residual: `paper` is Eq. 7 as printed; `balanced` weighs measured occupied voxels up."""
+    iterations: int = 350
+    """Steps of the search."""
+    population: int = 17
+    """Candidates per CMA-ES step."""
+    sigma0: float = 0.5
+    """First step size of CMA-ES, in standard deviations of the training codes."""
+    step_size: float = 0.14
+    """Step size of gradient descent."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    frames: int = 6
+    """Depth frames along the orbit, 20 degrees apart."""
+    output: Path = Path("out/demo")
+    """Folder for mesh.glb, grid.npz, result.json and overview.png."""
+    weights: Path | None = None
+    """Weights to use instead of those that come with the package."""
+    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
+    seed: int = 0
+    """Which chair, and which random numbers."""
+
+    def run(self) -> None:
+        start = time.perf_counter()
+        import jax
+        import numpy as np
+
+        from jaxshape.data.capture import camera_distance, capture, measure_frames
+        from jaxshape.data.dataset import TEST_SEEDS, load_object
+        from jaxshape.geometry import camera, fusion
+        from jaxshape.results.output import Observation
+
+        _require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
+        _require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
+        model = load_object(TEST_SEEDS + self.seed)
+        T_object_camera = camera.orbit(self.frames, camera_distance(model.mesh))
+        seen = capture(model.mesh, T_object_camera, noise=True, seed=self.seed)
+        merged = fusion.merge_all(measure_frames(seen))
+        observation = Observation(
+            depth=list(np.asarray(seen.depth)[:6]),
+            occupied=np.asarray(fusion.occupied(merged)),
+            occluded=np.asarray(fusion.occluded(merged)),
+            frame=seen.frame,
+            T_world_object=np.eye(4),
+            truth=np.asarray(seen.surface),
+        )
+        figures = {"object": f"procedural chair {TEST_SEEDS + self.seed}", "frames": self.frames}
+        result = _rebuild(self, observation, figures, start, jax.random.key(self.seed))
+        console.print(
+            f"IoU with the true surface: encoder {result['iou_encoder']:.3f}, "
+            f"refined {result['iou_refined']:.3f}, composed {result['iou_composed']:.3f}"
+        )
+
+
+@dataclass(frozen=True)
+class Dataset:
+    output: Path
+    """Folder of the dataset; a build that was killed goes on when asked for again."""
+    chairs: int = 8000
+    """Procedural chairs to make, unless --meshes is given."""
+    meshes: Path | None = None
+    """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural chairs."""
+    up: str = "y"
+    """Axis of the meshes that points up: x, y, z, -x, -y or -z."""
+    front: str = "z"
+    """Axis of the meshes along which the object's front looks."""
+    views: int = 18
+    """Random views of each object."""
+    noisy: float = 0.5
+    """Share of the objects whose views get the faults of a real depth sensor."""
+    workers: int = os.cpu_count() or 1
+    """Processes."""
+    seed: int = 0
+    """Of views, noise and surface samples."""
+
+    def run(self) -> None:
+        from jaxshape.data.archives import list_meshes
+        from jaxshape.data.dataset import TEST_SEEDS, DatasetConfig, build_dataset
+        from jaxshape.data.meshes import axes_to_canonical
+
+        _require(1 <= self.chairs <= TEST_SEEDS, f"--chairs is {self.chairs}; give 1 to 1000000.")
+        _require(self.views >= 1, f"--views is {self.views}; give 1 or more.")
+        _require(self.workers >= 1, f"--workers is {self.workers}; give 1 or more.")
+        axes_to_canonical(self.up, self.front)
+        objects: Sequence[Any] = list_meshes(self.meshes) if self.meshes else range(self.chairs)
+        config = DatasetConfig(self.views, self.noisy, self.up, self.front, self.seed)
+        with progress_bar("objects") as bar:
+            task = bar.add_task("dataset", total=len(objects), note="")
+            done = None
+            for done in build_dataset(self.output, objects, config, workers=self.workers):
+                note = f"{len(done.skipped)} skipped" if done.skipped else ""
+                bar.update(task, completed=done.objects, note=note)
+        _report_skipped(done.skipped if done else [])
+        _require(
+            done is None or len(done.skipped) < len(objects),
+            f"None of the {len(objects)} meshes could be used; see the reasons above.",
+        )
+
+
+@dataclass(frozen=True)
+class Train:
+    dataset: Path
+    """Folder made by `jaxshape dataset`."""
+    output: Path
+    """Folder for weights.safetensors, card.json, metrics.jsonl and the checkpoint."""
+    steps: int = 6000
+    """Batches."""
+    batch: int = 32
+    """Pairs in a batch."""
+    learning_rate: float = 1e-3
+    """Peak of Adam's step size; it decays along a cosine."""
+    max_views: int = 18
+    """Inputs fuse 1 to this many random views."""
+    encoder: tuple[int, int, int, int] = (32, 64, 128, 256)
+    """Channels of the encoder."""
+    decoder: tuple[int, int, int] = (128, 64, 32)
+    """Channels of the decoder."""
+    code: int = 100
+    """Numbers in a code."""
+    bfloat16: bool = False
+    """Compute convolutions in bfloat16; fast where the hardware has it."""
+    report_every: int = 100
+    """Steps between checkpoints; a killed run goes on from the last when asked for again."""
+    seed: int = 0
+    """Of the first weights and of the batches."""
+
+    def run(self) -> None:
+        from jaxshape.data.dataset import open_dataset
+        from jaxshape.files import atomic_path
+        from jaxshape.model.autoencoder import Architecture
+        from jaxshape.model.training import TrainConfig, finished_prior, read_metrics, train
+        from jaxshape.model.weights import save_prior
+
+        config = TrainConfig(
+            Architecture(self.encoder, self.decoder, self.code),
+            self.steps,
+            self.batch,
+            self.learning_rate,
+            self.max_views,
+            self.bfloat16,
+            self.report_every,
+            self.seed,
+        )
+        data = open_dataset(self.dataset)
+        with progress_bar("steps") as bar:
+            task = bar.add_task("train", total=self.steps, note="compiling")
+            for report in train(self.output, data, config):
+                note = (
+                    f"loss {report.loss:.4f}  IoU {report.iou:.3f}  "
+                    f"{report.samples_per_second:.0f} samples/s"
+                )
+                bar.update(task, completed=report.step, note=note)
+        metrics = read_metrics(self.output)
+        card = {
+            "data": json.loads((self.dataset / "dataset.json").read_text()),
+            "command": " ".join(["jaxshape", *sys.argv[1:]]),
+            "seed": self.seed,
+            "samples": self.steps * self.batch,
+            "training_loss": metrics[-1].loss,
+            "training_iou": metrics[-1].iou,
+            "training_seconds": round(sum(m.seconds for m in metrics)),
+            "licence": "Apache-2.0",
+        }
+        prior = finished_prior(self.output, data, config)
+        save_prior(self.output / "weights.safetensors", prior, card)
+        with atomic_path(self.output / "card.json") as path:
+            path.write_text(json.dumps(card, indent=2))
+        console.print(f"wrote {self.output / 'weights.safetensors'}")
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    frames: Positional[Path]
+    """Folder of frame-N.depth.png, frame-N.pose.txt and camera-intrinsics.txt (7-Scenes layout);
+    frame-N.mask.png beside them tells the object from the rest."""
+    box: Path | None = None
+    """JSON file with the object's box: {"T_world_object": 4x4, "size": [x, y, z]}. The object
+    frame has +y up and its front along +z. Needed where there are no masks."""
+    every: int = 1
+    """Use every n-th frame."""
+    depth_scale: float = 1000.0
+    """Depth units in a metre."""
+    min_hits: int = 1
+    """Depth points that make a voxel occupied; more than 1 suppresses stray points."""
+    isotropic: bool = False
+    """Scale all axes alike, as the paper does on real data, instead of filling the box."""
+    output: Path = Path("out/reconstruct")
+    """Folder for mesh.glb, grid.npz, result.json and overview.png."""
+    weights: Path | None = None
+    """Weights to use instead of those that come with the package."""
+    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
+    seed: int = 0
+    """Of the search."""
+
+    def run(self) -> None:
+        start = time.perf_counter()
+        import jax
+
+        from jaxshape.data.boxes import read_box
+        from jaxshape.data.sequences import open_sequence, poses_look_inverted
+        from jaxshape.results.scan import observe_sequence
+
+        _require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
+        _require(self.min_hits >= 1, f"--min-hits is {self.min_hits}; give 1 or more.")
+        sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
+        box = read_box(self.box) if self.box else None
+        _require(
+            not poses_look_inverted(sequence),
+            f"The poses in {str(self.frames)!r} look like world to camera: the frames agree better "
+            "when each is inverted. Write camera to world.",
+        )
+        with progress_bar("frames") as bar:
+            chosen = range(0, len(sequence), self.every)
+            watched = bar.track(chosen, task_id=bar.add_task("fuse", note=""))
+            observation = observe_sequence(
+                sequence, watched, box, min_hits=self.min_hits, isotropic=self.isotropic
+            )
+        figures = {"object": str(self.frames), "frames": len(chosen)}
+        _rebuild(self, observation, figures, start, jax.random.key(self.seed))
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    meshes: Path
+    """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
+    output: Path
+    """JSON file for config, per_mesh and means."""
+    frames: str = "1,4,8,18"
+    """Numbers of frames to fuse, with commas: the first k of an orbit in steps of 20 degrees."""
+    methods: str = "encoder,gradient,cma"
+    """Methods to score, with commas."""
+    up: str = "y"
+    """Axis of the meshes that points up: x, y, z, -x, -y or -z."""
+    front: str = "z"
+    """Axis of the meshes along which the object's front looks."""
+    noise: bool = False
+    """Add the faults of a real depth sensor."""
+    weights: Path | None = None
+    """Weights to use instead of those that come with the package."""
+    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
+    seed: int = 0
+    """Of noise, surface samples and searches."""
+
+    def run(self) -> None:
+        start = time.perf_counter()
+        from jaxshape.data.archives import list_meshes
+        from jaxshape.data.meshes import axes_to_canonical
+        from jaxshape.files import atomic_path
+        from jaxshape.model.weights import load_prior
+        from jaxshape.refine.reconstruction import METHODS
+        from jaxshape.results import evaluation
+
+        frames = _numbers(self.frames, "--frames")
+        methods = tuple(self.methods.split(","))
+        for method in methods:
+            _require(
+                method in METHODS,
+                f"--methods names {method!r}; choose from {', '.join(METHODS)}, with commas.",
+            )
+        axes_to_canonical(self.up, self.front)
+        prior, sources = load_prior(self.weights), list_meshes(self.meshes)
+        config = evaluation.EvaluateConfig(
+            frames, methods, self.noise, _refine_config(self.search), self.seed
+        )
+        models, skipped = _load_models(sources, self.up, self.front)
+        per_mesh = []
+        with progress_bar("meshes") as bar:
+            task = bar.add_task("evaluate", total=len(models), note="")
+            for scores in evaluation.evaluate(prior, models, config):
+                per_mesh.append(scores)
+                bar.update(task, advance=1, note=scores["name"])
+        means = evaluation.summarize(per_mesh, config)
+        content = {
+            "config": {
+                **evaluation.as_json(config),
+                "meshes": str(self.meshes),
+                "weights": str(self.weights) if self.weights else "chair (packaged)",
+                "seconds": round(time.perf_counter() - start, 1),
+            },
+            "skipped": [s._asdict() for s in skipped],
+            "per_mesh": per_mesh,
+            "means": means,
+        }
+        with atomic_path(self.output) as path:
+            path.write_text(json.dumps(content, indent=1))
+        console.print(_table(means, len(per_mesh)))
+
+
+# ------------------------------------------------------------------ shared by the commands
+
+
+def _rebuild(command: Any, observation: Any, figures: dict, start: float, key: Any) -> dict:
+    """Encode, search by CMA-ES, and write the files of one observed object."""
+    import jax.numpy as jnp
+
+    from jaxshape.model.weights import load_prior
+    from jaxshape.refine.reconstruction import reconstruct_jit, refiner_for, require_measured
+    from jaxshape.results.output import write_result
+
+    require_measured(observation.occupied)
+    prior, config = load_prior(command.weights), _refine_config(command.search)
+    with console.status("searching the space of shapes"):
+        occupied, occluded = jnp.asarray(observation.occupied), jnp.asarray(observation.occluded)
+        reconstruction = reconstruct_jit(refiner_for("cma", prior, config), config)(
+            key, prior, occupied[None], occluded[None]
+        )
+        seconds = round(time.perf_counter() - start, 2)
+        figures = {**figures, "seed": command.seed, "search": vars(command.search)}
+        figures["seconds"] = seconds
+        result = write_result(command.output, observation, reconstruction, figures)
+    console.print(
+        f"objective: encoder {result['objective_encoder']:.4f}, "
+        f"refined {result['objective_refined']:.4f} nats per voxel"
+    )
+    console.print(f"wrote mesh.glb, grid.npz, overview.png, result.json to {command.output}")
+    return result
+
+
+def _refine_config(search: Search):
+    from jaxshape.refine.reconstruction import RefineConfig
+
+    _require(search.iterations >= 1, f"--iterations is {search.iterations}; give 1 or more.")
+    return RefineConfig(**vars(search))
+
+
+def _load_models(sources, up: str, front: str):
+    """Load meshes, and refuse a set that seems to lie on its side."""
+    from jaxshape.data.meshes import Skipped, load, lying_on_its_side
+
+    with progress_bar("meshes") as bar:
+        task = bar.add_task("read", note="")
+        found = [load(s, up=up, front=front) for s in bar.track(sources, task_id=task)]
+    skipped = [f for f in found if isinstance(f, Skipped)]
+    models = [f for f in found if not isinstance(f, Skipped)]
+    _report_skipped(skipped)
+    _require(
+        bool(models),
+        f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
+        f"{skipped[0].reason}. {skipped[0].detail}"
+        if skipped
+        else "",
+    )
+    lying = [model.name for model in models if lying_on_its_side(model.mesh)]
+    _require(
+        2 * len(lying) <= len(models),
+        f"{len(lying)} of {len(models)} meshes seem to lie on their side, {lying[:1]} for one; "
+        "name the axis that points up, for example --up z --front -y.",
+    )
+    return models, skipped
+
+
+def _report_skipped(skipped) -> None:
+    for one in skipped:
+        console.print(f"[yellow]skipped[/] {escape(one.name)}: {one.reason}. {escape(one.detail)}")
+
+
+def _numbers(text: str, option: str) -> tuple[int, ...]:
+    try:
+        numbers = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    _require(
+        bool(numbers) and min(numbers, default=0) >= 1 and len(set(numbers)) == len(numbers),
+        f"{option} is {text!r}; give different whole numbers from 1 up, with commas, as in 1,4,8.",
+    )
+    return numbers
+
+
+def _table(means: dict, count: int) -> Table:
+    table = Table(title=f"means over {count} meshes", title_justify="left")
+    for column in ("frames", "method", "IoU", "IoU composed", "Chamfer-L1", "F-score", "objective"):
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for k, methods in means.items():
+        for method, scores in methods.items():
+            if method == "bounds":
+                for name, value in scores.items():
+                    table.add_row(k, name, f"{value:.3f}")
+            else:
+                table.add_row(k, method, *[f"{value:.3f}" for value in scores.values()])
+    return table
+
+
+def progress_bar(unit: str) -> Progress:
+    """A bar with counts, the time left, and a free text."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=console,
+    )
+
+
+class BadInput(ValueError):
+    """An option cannot be used."""
+
+
+def _require(condition: bool, sentence: str) -> None:
+    if not condition:
+        raise BadInput(sentence)
+
+
+_Command = (
+    Annotated[
+        Demo,
+        subcommand(
+            "demo",
+            description="Rebuild a procedural chair nobody trained on from a noisy orbit of depth "
+            "frames, and compare with the truth.\n\nExample: jaxshape demo --seed 3",
+        ),
+    ]
+    | Annotated[
+        Dataset,
+        subcommand(
+            "dataset",
+            description="Build training pairs: single views and complete surfaces, 4 KiB a grid."
+            "\n\nExamples: jaxshape dataset --output data/chairs\n\n"
+            "jaxshape dataset --output data/mugs --meshes mugs/ --up z --front -y",
+        ),
+    ]
+    | Annotated[
+        Train,
+        subcommand(
+            "train",
+            description="Train the auto-encoder on a dataset; the same command resumes.\n\n"
+            "Example: jaxshape train --dataset data/chairs --output out/train",
+        ),
+    ]
+    | Annotated[
+        Reconstruct,
+        subcommand(
+            "reconstruct",
+            description="Rebuild an object from depth frames with known poses.\n\n"
+            "Example: jaxshape reconstruct scan/ --box scan/box.json --every 5",
+        ),
+    ]
+    | Annotated[
+        Evaluate,
+        subcommand(
+            "evaluate",
+            description="Score methods on meshes seen along an orbit at 30 degrees elevation."
+            "\n\nExample: jaxshape evaluate --meshes chairs/ --frames 1,4,8,18 "
+            "--methods encoder,gradient,cma --output scores.json",
+        ),
+    ]
+)
+
+
+def main() -> None:
+    """Run the command line; the entry point of the console script."""
+    warnings.showwarning = lambda message, *_, **__: console.print(f"[yellow]warning[/] {message}")
+    command = tyro.cli(_Command, prog="jaxshape")  # pyright: ignore[reportArgumentType]
+    try:
+        command.run()
+    except (ValueError, OSError) as problem:
+        # Sentences for the user, by the convention of the package; anything else is a bug.
+        console.print(f"[red]jaxshape:[/] {escape(str(problem))}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("stopped")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,215 @@
+"""Where meshes lie: folders, zip archives and furniture catalogues, listed without opening a mesh.
+
+Everything is read in memory, through `read_bytes`: nothing is ever unpacked to disk, so a member
+called `../../evil.obj` is only a name, and a member that inflates without end is cut off.
+"""
+
+import os
+import posixpath
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from trimesh.resolvers import Resolver
+
+MESH_SUFFIXES = (".obj", ".off", ".ply", ".glb", ".gltf", ".stl")
+ARCHIVE_SUFFIXES = (".zip", ".sh3f")
+
+MAX_BYTES = 512 * 2**20
+"""Largest file or inflated archive member that is read."""
+
+_SUFFIX = "|".join(map(re.escape, MESH_SUFFIXES + ARCHIVE_SUFFIXES))
+_CATALOGUE = "PluginFurnitureCatalog.properties"
+_CATALOGUE_FIELDS = (
+    "name", "creator", "license", "category", "tags",
+    "modelRotation", "width", "height", "depth",
+)  # fmt: skip
+
+
+class MeshSource(NamedTuple):
+    """One mesh that can be loaded: small, picklable, with no geometry in it."""
+
+    name: str
+    """Path below the listed root without suffixes, with `/` between folders and no `..`; where
+    two would be equal, each keeps its suffixes. No two of a listing are equal."""
+    path: str
+    """The file on disk: a mesh, or the archive that holds it."""
+    member: str | None = None
+    """The member inside the archive."""
+    metadata: dict[str, str] = {}  # noqa: RUF012 - never written to
+    """What a furniture catalogue says of it, under the catalogue's own field names."""
+
+
+class TooLarge(ValueError):
+    """A file or archive member is larger than `MAX_BYTES`."""
+
+
+def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
+    """List every mesh at `path`, in the order of their names, without loading any.
+
+    `path` is a mesh, an archive (`.zip`, or Sweet Home 3D's `.sh3f`), or a folder searched
+    recursively for both, as ShapeNet and ModelNet trees are; symbolic links to folders are not
+    followed, and hidden files are left out. An archive that cannot be opened is listed under its
+    own name, so that loading it reports why.
+
+    Raises `FileNotFoundError` where there is nothing at `path`, `ValueError` where no mesh is.
+    """
+    root = Path(path)
+    if not root.exists():
+        raise FileNotFoundError(f"There is no file or folder {str(root)!r} to read meshes from.")
+    files = _walk(root) if root.is_dir() else [root]
+    folder = root if root.is_dir() else root.parent
+    found: list[tuple[str, MeshSource]] = []
+    for file in files:
+        inside = file.relative_to(folder).as_posix()
+        if file.suffix.lower() in MESH_SUFFIXES:
+            found.append((inside, MeshSource("", str(file))))
+        elif file.suffix.lower() in ARCHIVE_SUFFIXES:
+            prefix = inside if root.is_dir() else ""
+            found += _list_archive(file, prefix)
+    if not found:
+        raise ValueError(
+            f"{str(root)!r} holds no mesh: looked for files ending in {', '.join(MESH_SUFFIXES)}, "
+            f"also inside {' and '.join(ARCHIVE_SUFFIXES)} archives."
+        )
+    return _named(found)
+
+
+def _walk(folder: Path) -> list[Path]:
+    files = []
+    for parent, _, names in os.walk(folder):
+        files += [Path(parent, name) for name in names]
+    return sorted(file for file in files if not _hidden(file.relative_to(folder).as_posix()))
+
+
+def _hidden(path: str) -> bool:
+    parts = path.split("/")
+    return "__MACOSX" in parts or any(re.match(r"\.[^.]", part) for part in parts)
+
+
+def _list_archive(file: Path, prefix: str) -> list[tuple[str, MeshSource]]:
+    """Return each mesh of an archive with its path below the root."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.namelist()
+            catalogue = _catalogue(archive) if _CATALOGUE in members else {}
+    except Exception:  # zipfile and its decompressors raise a dozen kinds on broken archives
+        return [(prefix or file.name, MeshSource("", str(file)))]
+    return [
+        (f"{prefix}/{member}", MeshSource("", str(file), member, catalogue.get(member, {})))
+        for member in dict.fromkeys(members)
+        if member.lower().endswith(MESH_SUFFIXES) and not _hidden(member)
+    ]
+
+
+def _named(found: list[tuple[str, MeshSource]]) -> list[MeshSource]:
+    """Name each source by its path, without suffixes unless another would have the same name."""
+    paths = [_safe(path) for path, _ in found]
+    stems = [re.sub(rf"(?i)({_SUFFIX})(?=/|$)", "", path) for path in paths]
+    shared = Counter(stems)
+    seen: Counter[str] = Counter()
+    sources = []
+    for path, stem, (_, source) in zip(paths, stems, found, strict=True):
+        name = stem if shared[stem] == 1 else path
+        seen[name] += 1  # members of one archive may even have equal paths, once made safe
+        sources.append(source._replace(name=name if seen[name] == 1 else f"{name}~{seen[name]}"))
+    return sorted(sources, key=lambda source: source.name)
+
+
+def _safe(path: str) -> str:
+    """Return a relative path that stays below any folder it is joined to."""
+    parts = re.split(r"[/\\]", path.replace("\0", "").replace(":", "_"))
+    return "/".join(part for part in parts if part not in ("", ".", "..")) or "mesh"
+
+
+def _catalogue(archive: zipfile.ZipFile) -> dict[str, dict[str, str]]:
+    """Return the fields of each member that a Sweet Home 3D furniture catalogue describes.
+
+    Lines read `name#12=Oak chair`: field, entry, value. Fields with no entry are of all of them.
+    """
+    content = _read_member(archive, _CATALOGUE)
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    text = re.sub(r"\\\r?\n\s*", "", text)  # a backslash continues a line
+    shared: dict[str, str] = {}
+    entries: dict[str, dict[str, str]] = {}
+    for field, entry, value in re.findall(r"(?m)^(\w+)(?:#(\d+))?[ \t]*[=:](.*)$", text):
+        fields = entries.setdefault(entry, {}) if entry else shared
+        fields[field] = re.sub(
+            r"\\(u[0-9a-fA-F]{4}|.)",
+            lambda escape: chr(int(escape[1][1:], 16)) if len(escape[1]) == 5 else escape[1],
+            value.strip(),
+        )
+    defaults = {field: shared[field] for field in ("license",) if field in shared}
+    return {
+        fields["model"].lstrip("/"): defaults
+        | {field: fields[field] for field in _CATALOGUE_FIELDS if field in fields}
+        for fields in entries.values()
+        if "model" in fields
+    }
+
+
+def read_bytes(source: MeshSource, beside: str | None = None) -> bytes:
+    """Return the content of a mesh's file, or of the file at `beside`, relative to its folder.
+
+    Raises `ValueError` where `beside` leaves the folder or the archive, `TooLarge` above
+    `MAX_BYTES`, and what `open` and `zipfile` raise.
+    """
+    path = Path(source.path)
+    if source.member is None and path.suffix.lower() in ARCHIVE_SUFFIXES:
+        raise zipfile.BadZipFile(f"{path.name} is not a readable zip archive.")
+    if source.member is None:
+        file = path if beside is None else path.parent / _below(beside)
+        if not file.is_file():  # a device or a pipe could be read for ever
+            raise FileNotFoundError(f"There is no file {file.name!r} beside the mesh.")
+        with open(file, "rb") as stream:
+            return _read(stream.read, file.name)
+    with zipfile.ZipFile(path) as archive:
+        member = source.member
+        if beside is not None:
+            member = _below(posixpath.join(posixpath.dirname(member), beside))
+        return _read_member(archive, member)
+
+
+def _read_member(archive: zipfile.ZipFile, member: str) -> bytes:
+    with archive.open(member) as stream:
+        return _read(stream.read, member)
+
+
+def _below(name: str) -> str:
+    path = PurePosixPath(posixpath.normpath(name.replace("\\", "/")))
+    if path.is_absolute() or path.parts[:1] == ("..",):
+        raise ValueError(f"The mesh refers to {name!r}, outside its own folder; it is not read.")
+    return str(path)
+
+
+def _read(read: Callable[[int], bytes], name: str) -> bytes:
+    """Read to the end, but stop at the limit, whatever length a header promises."""
+    content = read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise TooLarge(f"{name!r} is larger than {MAX_BYTES // 2**20} MiB.")
+    return content
+
+
+class Beside(Resolver):
+    """Finds the files a mesh refers to, such as a glTF file's buffers, but never its pictures."""
+
+    def __init__(self, source: MeshSource):
+        self._read: Callable[[str], bytes] = lambda name: read_bytes(source, name)
+
+    def get(self, key: str) -> bytes:
+        return self._read(key)
+
+    def keys(self) -> list[str]:
+        return []
+
+    def write(self, name: str, data: bytes) -> None:
+        raise NotImplementedError("Meshes are only read here.")
+
+    def namespaced(self, namespace: str) -> "Beside":
+        raise NotImplementedError("Meshes are read with names relative to their own folder.")

@@ -1,0 +1,117 @@
+"""The oriented box that tells the object from the room."""
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxshape.data.sequences import SequenceError, check_rigid
+
+
+class Box(NamedTuple):
+    """An oriented box around the object, less some boxes that hold other things."""
+
+    T_world_object: Float[np.ndarray, "4 4"]
+    """Object frame: origin at the centre of the box, +y up, front along +z, metres."""
+    size: Float[np.ndarray, " 3"]
+    """Extent along the axes of the object, metres."""
+    exclude: Float[np.ndarray, "e 2 3"] = np.zeros((0, 2, 3))
+    """Lowest and highest corners, in the object frame, of boxes whose points are not the object."""
+
+
+def points_in_box(points: Float[np.ndarray, "*batch 3"], box: Box) -> Bool[np.ndarray, "*batch"]:
+    """Whether points, in world coordinates, lie in the box and in none of those it excludes."""
+    R, t = box.T_world_object[:3, :3], box.T_world_object[:3, 3]
+    p = (points - t) @ R  # the inverse of a rotation is its transpose, applied to rows
+    inside = _within(p, -box.size / 2, box.size / 2)
+    for low, high in box.exclude:
+        inside = inside & ~_within(p, low, high)
+    return inside
+
+
+def _within(
+    p: Float[np.ndarray, "*batch 3"], low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]
+) -> Bool[np.ndarray, "*batch"]:
+    return np.asarray(((low <= p) & (p <= high)).all(axis=-1))
+
+
+def read_box(path: str | Path) -> Box:
+    """Read an object box from JSON.
+
+    The file holds `{"T_world_object": 4x4, "size": [x, y, z]}` and may hold
+    `"exclude": [{"min": [x, y, z], "max": [x, y, z]}, ...]`, as the fields of `Box`. A file with
+    `world_to_level` (4x4, to a frame with z up) and `chair_box_level` (`X`, `Y` and `h`, each
+    lowest and highest) is read as a box whose front looks along the level X; such a file cannot
+    say where the front is, nor exclude anything.
+
+    Raises `SequenceError` for anything else.
+    """
+    try:
+        content = json.loads(Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise SequenceError(
+            f"{path} cannot be read as JSON ({error}); expected an object box: write "
+            '{"T_world_object": 4x4, "size": [x, y, z]}.'
+        ) from error
+    if not isinstance(content, dict):
+        raise SequenceError(f"{path} holds a JSON {type(content).__name__}; expected an object.")
+    box = _level_box(content, path) if "world_to_level" in content else _oriented_box(content, path)
+    check_rigid(box.T_world_object, path)
+    if not (np.isfinite(box.size).all() and (box.size > 0).all()):
+        raise SequenceError(
+            f"{path} gives the size {box.size.tolist()}; expected positive extents in metres: "
+            "give each axis from lowest to highest."
+        )
+    return box
+
+
+def _oriented_box(content: dict[str, Any], path: str | Path) -> Box:
+    excluded = content.get("exclude", [])
+    if not (isinstance(excluded, list) and all(isinstance(one, dict) for one in excluded)):
+        raise SequenceError(
+            f"{path} gives {excluded} as exclude; expected a list of boxes: "
+            'write [{"min": [x, y, z], "max": [x, y, z]}].'
+        )
+    exclude = [[_numbers(one, end, (3,), path) for end in ("min", "max")] for one in excluded]
+    return Box(
+        T_world_object=_numbers(content, "T_world_object", (4, 4), path),
+        size=_numbers(content, "size", (3,), path),
+        exclude=np.array(exclude, dtype=np.float64).reshape(-1, 2, 3),
+    )
+
+
+def _level_box(content: dict[str, Any], path: str | Path) -> Box:
+    if "exclude_level" in content:
+        warnings.warn(
+            f"{path}: exclude_level is a rule in words and is not applied; write the box with "
+            'T_world_object, size and "exclude" to leave things out.',
+            stacklevel=3,
+        )
+    T_level_world = _numbers(content, "world_to_level", (4, 4), path)
+    level = content.get("chair_box_level", {})
+    x, y, height = (_numbers(level, axis, (2,), path) for axis in ("X", "Y", "h"))
+    front, _, up = T_level_world[:3, :3]
+    T_world_object = np.eye(4)
+    # By a cross product, as the level frame of the known files is left-handed.
+    T_world_object[:3, :3] = np.stack([np.cross(up, front), up, front], axis=1)
+    center = np.array([x.mean(), y.mean(), height.mean(), 1.0])
+    T_world_object[:, 3] = np.linalg.inv(T_level_world) @ center
+    return Box(T_world_object, size=np.array([np.diff(r)[0] for r in (y, height, x)]))
+
+
+def _numbers(
+    content: dict[str, Any], key: str, shape: tuple[int, ...], path: str | Path
+) -> Float[np.ndarray, "..."]:
+    try:
+        numbers = np.array(content[key], dtype=np.float64)
+    except (KeyError, TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != shape:
+        raise SequenceError(
+            f"{path} gives {content.get(key)} as {key}; expected numbers of shape {shape}: "
+            "see jaxshape.data.boxes.read_box."
+        )
+    return numbers

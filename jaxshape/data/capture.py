@@ -1,0 +1,74 @@
+"""One object seen by the virtual camera: depth frames, measurements, ground truth. [host]"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import trimesh
+from jaxtyping import Array, Bool, Float
+
+from jaxshape.data import meshes, render
+from jaxshape.geometry import fusion, grid
+from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.fusion import Measurement
+from jaxshape.geometry.grid import GridFrame
+
+SURFACE_SAMPLES = 50_000
+"""Points sampled on a CAD model to find its surface voxels: some 15 for each of them."""
+
+
+class Capture(NamedTuple):
+    """An object, and depth frames of it."""
+
+    depth: Float[Array | np.ndarray, "views h w"]
+    """Metres; 0 where nothing is known, infinite where the ray met nothing."""
+    intrinsics: Intrinsics
+    T_object_camera: jaxlie.SE3
+    frame: GridFrame
+    surface: Bool[Array | np.ndarray, "x y z"]
+    """Voxels that hold a point of the CAD model's surface: the ground truth **Y**."""
+
+
+def capture(
+    mesh: trimesh.Trimesh,
+    T_object_camera: jaxlie.SE3,
+    *,
+    noise: bool,
+    seed: int,
+    image_size: int = render.IMAGE_SIZE,
+) -> Capture:
+    """Look at a canonical mesh from some poses, and find its surface voxels.
+
+    The ground truth comes straight from points on the CAD model, not through the depth frames, so
+    that it is complete (paper, section 2.3).
+    """
+    intrinsics = render.fit_intrinsics(mesh, T_object_camera, image_size)
+    depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, image_size)
+    if noise:
+        depth = render.add_sensor_noise(depth, cosine, np.random.default_rng(seed))
+    frame = grid.fit_box(*np.float32(mesh.bounds))
+    points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
+    return Capture(depth, intrinsics, T_object_camera, frame, discretize(points, frame))
+
+
+def camera_distance(mesh: trimesh.Trimesh) -> float:
+    """How far from the object's centre the virtual camera stands, in metres."""
+    return render.DISTANCE * float(mesh.scale)
+
+
+@jax.jit
+def discretize(points: Float[Array, "n 3"], frame: GridFrame) -> Bool[Array, "x y z"]:
+    """Surface voxels of object-frame points: `D(P)` of the paper."""
+    return fusion.count_points(grid.voxel_from_object(frame, points)) > 0
+
+
+@jax.jit
+def measure_frames(captured: Capture) -> Measurement:
+    """One measurement per frame; every pixel that hit something shows the object."""
+    depth = jnp.asarray(captured.depth)
+    measure = partial(fusion.measure, intrinsics=captured.intrinsics, frame=captured.frame)
+    one = lambda depth, T: measure(depth, jnp.isfinite(depth), T_object_camera=T)  # noqa: E731
+    return jax.vmap(one)(depth, captured.T_object_camera)

@@ -1,0 +1,238 @@
+"""Training pairs on disk: partial views and complete surfaces of many objects. [host]
+
+A dataset is a folder of shards. A shard holds up to `OBJECTS_PER_SHARD` objects in one `.npy` of
+bit-packed grids, `[object, 1 + view, 4096]` bytes, where entry 0 is the complete surface **Y** and
+the others are the measurements **F** of one frame each; a `.json` beside it names its objects and
+what was skipped. Shards are written whole or not at all, so a killed build goes on where it
+stopped, and a finished one has nothing left to do.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import trimesh
+from jaxtyping import Array, Bool, UInt8
+
+from jaxshape.data import meshes
+from jaxshape.data.archives import MeshSource
+from jaxshape.data.capture import Capture, camera_distance, capture, measure_frames
+from jaxshape.data.chairs import random_chair
+from jaxshape.data.meshes import Model, Skipped
+from jaxshape.files import atomic_path
+from jaxshape.geometry import camera, fusion
+from jaxshape.geometry.grid import RESOLUTION
+
+OBJECTS_PER_SHARD = 64
+
+TEST_SEEDS = 1_000_000
+"""Procedural chairs from this seed on are for tests; training uses smaller ones."""
+
+Object = int | MeshSource
+"""What can be built into a dataset: the seed of a procedural chair, or a mesh file."""
+
+
+class DatasetError(ValueError):
+    """A dataset folder cannot be read or continued."""
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What, with the objects themselves, decides every byte of a dataset."""
+
+    views: int = 18
+    """Random views of each object (paper: 18)."""
+    noisy: float = 0.5
+    """Share of the objects whose depth images get the faults of a real sensor."""
+    up: str = "y"
+    """Axis of the mesh files that points up; one of x, y, z, -x, -y, -z."""
+    front: str = "z"
+    """Axis of the mesh files along which the object's front looks."""
+    seed: int = 0
+
+
+class Progress(NamedTuple):
+    """How much of a build is done."""
+
+    objects: int
+    total: int
+    skipped: list[Skipped]
+
+
+# ------------------------------------------------------------------ one object
+
+
+def load_object(item: Object, *, up: str = "y", front: str = "z") -> Model | Skipped:
+    """Make or read one object in the canonical frame."""
+    if isinstance(item, MeshSource):
+        return meshes.load(item, up=up, front=front)
+    return Model(f"chair-{item}", random_chair(item), {})
+
+
+def training_grids(
+    mesh: trimesh.Trimesh, config: DatasetConfig, seed: int
+) -> UInt8[np.ndarray, "n bytes"]:
+    """The complete surface of one object and its views, packed."""
+    key = jax.random.key(seed)
+    T_object_camera = camera.random_views(key, config.views, camera_distance(mesh))
+    noise = bool(np.random.default_rng(seed).random() < config.noisy)
+    captured = capture(mesh, T_object_camera, noise=noise, seed=seed)
+    views = _occupied_by_frame(captured)
+    return pack(np.concatenate([np.asarray(captured.surface)[None], np.asarray(views)]))
+
+
+@jax.jit
+def _occupied_by_frame(captured: Capture) -> Bool[Array, "views x y z"]:
+    """The measurement **F** of each frame alone; jit leaves out what it does not need."""
+    return fusion.occupied(measure_frames(captured))
+
+
+def pack(grids: Bool[np.ndarray, "*batch x y z"]) -> UInt8[np.ndarray, "*batch bytes"]:
+    """Eight voxels a byte: 4 KiB for a grid."""
+    return np.packbits(grids.reshape(*grids.shape[:-3], -1), axis=-1)
+
+
+def unpack(packed: UInt8[np.ndarray, "*batch bytes"]) -> Bool[np.ndarray, "*batch x y z"]:
+    """The grids that were packed."""
+    grids = np.unpackbits(packed, axis=-1).astype(bool)
+    return grids.reshape(*packed.shape[:-1], *[RESOLUTION] * 3)
+
+
+# ------------------------------------------------------------------ writing
+
+
+def build_dataset(
+    folder: str | os.PathLike[str],
+    objects: Sequence[Object],
+    config: DatasetConfig = DatasetConfig(),
+    *,
+    workers: int | None = None,
+) -> Iterator[Progress]:
+    """Write the shards that are missing, in parallel processes, yielding progress after each.
+
+    Raises `DatasetError` when the folder holds a dataset of other objects or settings.
+    """
+    folder = Path(folder)
+    _claim(folder, objects, config)
+    starts = range(0, len(objects), OBJECTS_PER_SHARD)
+    shards = [(n, objects[s : s + OBJECTS_PER_SHARD]) for n, s in enumerate(starts)]
+    missing = [shard for shard in shards if not _shard_path(folder, shard[0], "json").exists()]
+    done = sum(len(items) for _, items in shards) - sum(len(items) for _, items in missing)
+    skipped = [s for n, _ in shards if (n, _) not in missing for s in _read_names(folder, n)[1]]
+    yield Progress(done, len(objects), skipped)
+    if not missing:
+        return
+    write = partial(_write_shard, folder, config)
+    workers = min(workers or os.cpu_count() or 1, len(missing))
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(write, *shard): shard for shard in missing}
+        for future in as_completed(futures):
+            skipped = skipped + future.result()
+            done += len(futures[future][1])
+            yield Progress(done, len(objects), skipped)
+
+
+def _write_shard(
+    folder: Path, config: DatasetConfig, number: int, items: Sequence[Object]
+) -> list[Skipped]:
+    names, grids, skipped = [], [], []
+    for i, item in enumerate(items):
+        model = load_object(item, up=config.up, front=config.front)
+        if isinstance(model, Skipped):
+            skipped.append(model)
+            continue
+        seed = hash_seed(config.seed, number * OBJECTS_PER_SHARD + i)
+        names.append(model.name)
+        grids.append(training_grids(model.mesh, config, seed))
+    shape = (0, 1 + config.views, RESOLUTION**3 // 8)
+    with atomic_path(_shard_path(folder, number, "npy")) as path:
+        np.save(path, np.stack(grids) if grids else np.zeros(shape, np.uint8))
+    # The names come last: a shard counts as written once they are there.
+    with atomic_path(_shard_path(folder, number, "json")) as path:
+        path.write_text(json.dumps({"names": names, "skipped": skipped}, indent=1))
+    return skipped
+
+
+def hash_seed(*numbers: int) -> int:
+    """A seed below 2^31 for each tuple of numbers, unrelated between neighbours."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0] >> 1)
+
+
+def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> None:
+    names = [item.name if isinstance(item, MeshSource) else str(item) for item in objects]
+    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
+    claim = {"config": asdict(config), "objects": len(names), "names_sha256": digest}
+    path = folder / "dataset.json"
+    if path.exists():
+        if json.loads(path.read_text()) != claim:
+            raise DatasetError(
+                f"{str(folder)!r} already holds a dataset of other objects or settings; "
+                "give another folder, or remove this one."
+            )
+        return
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(claim, indent=1))
+
+
+def _shard_path(folder: Path, number: int, suffix: str) -> Path:
+    return folder / f"shard-{number:05d}.{suffix}"
+
+
+def _read_names(folder: Path, number: int) -> tuple[list[str], list[Skipped]]:
+    content = json.loads(_shard_path(folder, number, "json").read_text())
+    return content["names"], [Skipped(*entry) for entry in content["skipped"]]
+
+
+# ------------------------------------------------------------------ reading
+
+
+class Dataset(NamedTuple):
+    """Objects of a dataset folder, left on disk until they are asked for."""
+
+    names: list[str]
+    shards: list[UInt8[np.ndarray, "object view bytes"]]
+    """Memory-mapped; entry 0 of the second axis is the complete surface."""
+    row: list[tuple[int, int]]
+    """Shard, and place in it, of each object."""
+
+    @property
+    def views(self) -> int:
+        return self.shards[0].shape[1] - 1
+
+    def packed(self, index: int) -> UInt8[np.ndarray, "view bytes"]:
+        """The packed surface of one object, followed by its views."""
+        shard, place = self.row[index]
+        return self.shards[shard][place]
+
+
+def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
+    """Open a finished dataset; raises `DatasetError` where there is none, or a part is missing."""
+    folder = Path(folder)
+    if not (folder / "dataset.json").exists():
+        raise DatasetError(f"There is no dataset in {str(folder)!r}; make one: jaxshape dataset.")
+    count = json.loads((folder / "dataset.json").read_text())["objects"]
+    expected = -(-count // OBJECTS_PER_SHARD)
+    missing = [n for n in range(expected) if not _shard_path(folder, n, "json").exists()]
+    if missing:
+        raise DatasetError(
+            f"{len(missing)} of the {expected} shards of {str(folder)!r} are missing; "
+            "run the same `jaxshape dataset` command again to finish it."
+        )
+    names, shards, row = [], [], []
+    for number in range(expected):
+        inside = _read_names(folder, number)[0]
+        names += inside
+        row += [(number, place) for place in range(len(inside))]
+        shards.append(np.load(_shard_path(folder, number, "npy"), mmap_mode="r"))
+    if not names:
+        raise DatasetError(f"Every object of the dataset in {str(folder)!r} was skipped.")
+    return Dataset(names, shards, row)

@@ -1,0 +1,202 @@
+"""CAD meshes in the canonical object frame, read from files, folders, archives and catalogues.
+
+    for model in read_meshes("chairs/"):       # Model or Skipped, in the order of their names
+        ...
+
+`list_meshes` finds them without opening any, `load` opens one: share those out over processes.
+"""
+
+import io
+import os
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from jaxshape.data.archives import Beside, MeshSource, TooLarge, list_meshes, read_bytes
+from jaxshape.data.orientation import apparent_up
+
+__all__ = [
+    "MeshSource", "Model", "Skipped", "axes_to_canonical", "canonical", "list_meshes", "load",
+    "lying_on_its_side", "read_meshes", "sample_surface",
+]  # fmt: skip
+
+MAX_FACES = 20_000_000
+"""Most triangles of one mesh, counted over all its instances in a scene."""
+
+FLAT = 1e-6
+"""An object is flat when its smallest extent is below this fraction of its largest."""
+
+
+class Model(NamedTuple):
+    """A CAD model in the canonical object frame."""
+
+    name: str
+    """Stable identifier: the path below the root that was read, without suffix."""
+    mesh: trimesh.Trimesh
+    """Triangles only, +y up, front along +z, bounding box centred at the origin, in the units of
+    the file (metres where the file is in metres, as glTF is, or where a catalogue gives sizes)."""
+    metadata: dict[str, str]
+    """What a furniture catalogue says of it: name, creator, license, and so on; else empty."""
+
+
+class Skipped(NamedTuple):
+    """A mesh that cannot be used, and why."""
+
+    name: str
+    reason: str
+    """One of `unreadable`, `too large`, `empty` (no vertices), `no faces` (none with an area),
+    `not finite`, `flat` (an axis with no extent)."""
+    detail: str
+
+
+class _Unusable(ValueError):
+    def __init__(self, reason: str, detail: str):
+        super().__init__(reason, detail)
+
+
+def read_meshes(
+    path: str | os.PathLike[str], *, up: str = "y", front: str = "z"
+) -> Iterator[Model | Skipped]:
+    """Load every mesh at `path` in turn; see `list_meshes` for what is found, and its errors."""
+    sources = list_meshes(path)
+    axes_to_canonical(up, front)  # a wrong axis is reported once, not for every mesh
+    return (load(source, up=up, front=front) for source in sources)
+
+
+def load(source: MeshSource, *, up: str = "y", front: str = "z") -> Model | Skipped:
+    """Load one mesh, flattened and turned so that its `up` axis is +y and its `front` axis +z.
+
+    A file that is broken or holds nothing to use gives `Skipped`, never an exception. Materials
+    and pictures are dropped. Where a furniture catalogue describes the mesh, its rotation and
+    its size in centimetres are applied first, as Sweet Home 3D does.
+    """
+    axes_to_canonical(up, front)
+    try:
+        mesh = _usable(_parse(source))
+        _apply_catalogue(mesh, source.metadata)
+        return Model(source.name, canonical(mesh, up=up, front=front), dict(source.metadata))
+    except _Unusable as problem:
+        return Skipped(source.name, *problem.args)
+    except TooLarge as problem:
+        return Skipped(source.name, "too large", str(problem))
+    except Exception as problem:  # parsers of foreign files fail in any way there is
+        detail = " ".join(f"{type(problem).__name__}: {problem}".split())
+        return Skipped(source.name, "unreadable", detail[:300])
+
+
+def _parse(source: MeshSource) -> trimesh.Trimesh:
+    """Return all triangles of a file as one mesh, scene transforms applied."""
+    content = read_bytes(source)
+    file_type = os.path.splitext(source.member or source.path)[1].lower()
+    if not content.strip(b"\0 \t\r\n"):
+        raise _Unusable("empty", "The file has no content.")
+    if file_type == ".off":
+        # Many ModelNet files run the counts into the header: "OFF490926 518 0".
+        content = re.sub(rb"\A(\s*C?OFF)(?=\d)", rb"\1\n", content, count=1)
+    scene = trimesh.load_scene(
+        io.BytesIO(content),
+        file_type=file_type[1:],
+        resolver=Beside(source),
+        process=False,
+        skip_materials=True,
+    )
+    faces = sum(
+        len(getattr(scene.geometry[scene.graph[node][1]], "faces", ()))
+        for node in scene.graph.nodes_geometry
+    )
+    if faces > MAX_FACES:
+        raise _Unusable("too large", f"The mesh has {faces} faces, more than {MAX_FACES}.")
+    mesh = scene.to_mesh()
+    if not len(mesh.vertices):
+        raise _Unusable("empty", "The file holds no vertices of a triangle mesh.")
+    return mesh
+
+
+def _usable(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the triangles that have a finite, nonzero area, or say why there are none."""
+    vertices = np.asarray(mesh.vertices, np.float64)
+    faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+    if not len(faces):
+        raise _Unusable("no faces", f"The file holds {len(vertices)} vertices and no triangle.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise _Unusable("unreadable", "A face refers to a vertex that the file does not hold.")
+    faces = faces[np.all(np.isfinite(vertices[faces]), axis=(1, 2))]
+    if not len(faces):
+        raise _Unusable("not finite", "Every face has a vertex that is not a finite number.")
+    with np.errstate(over="ignore", invalid="ignore"):
+        area = trimesh.triangles.area(vertices[faces])
+    if not np.isfinite(area.sum()):
+        raise _Unusable("not finite", "The vertices are too far apart for areas to be finite.")
+    faces = faces[area > 0]
+    if not len(faces):
+        raise _Unusable("no faces", "Every face has zero area.")
+    usable = trimesh.Trimesh(vertices, faces, process=False)
+    usable.remove_unreferenced_vertices()
+    if usable.extents.min() <= FLAT * usable.extents.max():
+        size = " x ".join(f"{extent:.3g}" for extent in usable.extents)
+        raise _Unusable("flat", f"The mesh measures {size}: one axis has no extent.")
+    return usable
+
+
+def _apply_catalogue(mesh: trimesh.Trimesh, metadata: dict[str, str]) -> None:
+    """Turn and scale a catalogue's model: +y up, front +z, `width` x `height` x `depth` cm."""
+    if "modelRotation" in metadata:
+        rotation = np.array(metadata["modelRotation"].split(), float).reshape(3, 3)
+        mesh.vertices = mesh.vertices @ rotation.T
+    sizes = [metadata.get(field) for field in ("width", "height", "depth")]
+    if all(sizes):
+        mesh.vertices *= np.array(sizes, float) / 100 / mesh.extents
+
+
+def canonical(mesh: trimesh.Trimesh, *, up: str = "y", front: str = "z") -> trimesh.Trimesh:
+    """Turn a mesh so that `up` becomes +y and `front` +z, and centre its bounding box.
+
+    Axes are `x`, `y`, `z`, or those with a minus. The scale is kept. Raises `ValueError` where
+    the two axes are not perpendicular or not axes.
+    """
+    vertices = np.asarray(mesh.vertices) @ axes_to_canonical(up, front).T
+    turned = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    turned.vertices -= turned.bounds.mean(axis=0)
+    return turned
+
+
+def axes_to_canonical(up: str, front: str) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation that maps the axis named `up` to +y and the one named `front` to +z."""
+    for name, axis in (("up", up), ("front", front)):
+        if not re.fullmatch("-?[xyz]", axis):
+            raise ValueError(f"{name} must be one of x, y, z, -x, -y, -z, but is {axis!r}.")
+    if up[-1] == front[-1]:
+        raise ValueError(f"up and front must be perpendicular, but are {up!r} and {front!r}.")
+    y, z = ((-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[-1])]
+            for axis in (up, front))  # fmt: skip
+    return np.stack([np.cross(y, z), y, z])
+
+
+def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
+    """Sample `count` points on the surface, uniform in area, the same for the same seed.
+
+    The area is cut into `count` equal strata with one point in each, so that every part with
+    at least two points' worth of area is hit, however thin.
+    """
+    random = np.random.default_rng(seed)
+    area = np.cumsum(trimesh.triangles.area(mesh.triangles))
+    position = (np.arange(count) + random.random(count)) / count * area[-1]
+    face = np.minimum(np.searchsorted(area, position, side="right"), len(area) - 1)
+    # the square root makes points uniform over a triangle with corners a, b, c
+    s, t = np.sqrt(random.random(count))[:, None], random.random(count)[:, None]
+    a, b, c = np.moveaxis(mesh.triangles[face], 1, 0)
+    return (1 - s) * a + s * (1 - t) * b + s * t * c
+
+
+def lying_on_its_side(mesh: trimesh.Trimesh) -> bool:
+    """Return whether a seat in the canonical frame seems to lie on its side or upside down.
+
+    A heuristic for seats alone. On 78 upright seats it raised no false alarm, on upright chairs
+    made of boxes 2 in 100; turned on their sides, backs, fronts or heads, it knew 8 to 10 of 10.
+    So believe it of a set of meshes, by majority; stools and poufs look much the same either way.
+    """
+    return apparent_up(sample_surface(mesh, 6000, seed=0)) != "y"

@@ -1,0 +1,117 @@
+"""Pinhole cameras and the view-points of the paper.
+
+OpenCV axes: x right, y down, z forward. Depth is z, not ray length. The centre of pixel
+`(row, column)` is at image coordinates `(u, v) = (column + 0.5, row + 0.5)`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+class Intrinsics(NamedTuple):
+    """Focal lengths and principal point of a pinhole camera, in pixels."""
+
+    fx: Float[Array, "*batch"]
+    fy: Float[Array, "*batch"]
+    cx: Float[Array, "*batch"]
+    cy: Float[Array, "*batch"]
+
+
+def intrinsics_for(field_of_view: float, image_size: int) -> Intrinsics:
+    """A square image of `image_size` pixels that sees `field_of_view` degrees."""
+    focal = 0.5 * image_size / jnp.tan(jnp.deg2rad(field_of_view) / 2)
+    center = jnp.asarray(image_size / 2, focal.dtype)
+    return Intrinsics(focal, focal, center, center)
+
+
+def project(
+    intrinsics: Intrinsics, points: Float[Array, "*batch 3"]
+) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
+    """Camera-frame points to image coordinates `(u, v)` in pixels, and depth in metres.
+
+    Points at or behind the camera plane get finite but meaningless image coordinates; look at the
+    depth.
+    """
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    safe_z = jnp.where(z > 0, z, 1.0)
+    u = intrinsics.fx * x / safe_z + intrinsics.cx
+    v = intrinsics.fy * y / safe_z + intrinsics.cy
+    return jnp.stack([u, v], axis=-1), z
+
+
+def unproject(
+    intrinsics: Intrinsics, depth: Float[Array, "*batch h w"]
+) -> Float[Array, "*batch h w 3"]:
+    """The camera-frame point, in metres, that each pixel of a depth image measures.
+
+    Invalid (0) and empty (infinite) pixels give points at 0 and at infinity.
+    """
+    h, w = depth.shape[-2:]
+    u, v = jnp.arange(w) + 0.5, jnp.arange(h) + 0.5
+    x = (u - intrinsics.cx) / intrinsics.fx * depth
+    y = ((v - intrinsics.cy) / intrinsics.fy)[:, None] * depth
+    return jnp.stack([x, y, depth], axis=-1)
+
+
+def transform(T_a_b: jaxlie.SE3, points: Float[Array, "*batch n 3"]) -> Float[Array, "*batch n 3"]:
+    """Points of frame b in frame a; for whole clouds, a product with a matrix, not quaternions."""
+    return points @ T_a_b.rotation().as_matrix().mT + T_a_b.translation()[..., None, :]
+
+
+def look_at(eye: Float[Array, "*batch 3"], target: Float[Array, "*batch 3"]) -> jaxlie.SE3:
+    """`T_world_camera` of a camera at `eye` whose principal axis passes through `target`.
+
+    World +y is up and the image x-axis stays horizontal (paper, section 2.3), so looking straight
+    up or down is undefined.
+    """
+    forward = _unit(target - eye)
+    up = jnp.array([0.0, 1.0, 0.0])
+    right = _unit(jnp.cross(forward, up))
+    down = jnp.cross(forward, right)
+    R_world_camera = jnp.stack([right, down, forward], axis=-1)
+    return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(R_world_camera), eye)
+
+
+def on_sphere(
+    azimuth: Float[Array, "*batch"], elevation: Float[Array, "*batch"], radius: float
+) -> jaxlie.SE3:
+    """`T_object_camera` of cameras on a sphere that look at the origin.
+
+    Angles are in degrees: azimuth 0 stands in front of the object (+z) and grows towards its +x
+    side, elevation grows upwards. `radius` is in metres.
+    """
+    azimuth, elevation = jnp.deg2rad(azimuth), jnp.deg2rad(elevation)
+    direction = jnp.stack(
+        [
+            jnp.sin(azimuth) * jnp.cos(elevation),
+            jnp.sin(elevation),
+            jnp.cos(azimuth) * jnp.cos(elevation),
+        ],
+        axis=-1,
+    )
+    return look_at(radius * direction, jnp.zeros(3))
+
+
+def random_views(key: PRNGKeyArray, count: int, radius: float) -> jaxlie.SE3:
+    """Training views: azimuth in [0, 360), elevation in [30, 60) degrees.
+
+    The paper (section 2.3) prints the two ranges in swapped order.
+    """
+    azimuth_key, elevation_key = jax.random.split(key)
+    azimuth = jax.random.uniform(azimuth_key, (count,), minval=0.0, maxval=360.0)
+    elevation = jax.random.uniform(elevation_key, (count,), minval=30.0, maxval=60.0)
+    return on_sphere(azimuth, elevation, radius)
+
+
+def orbit(count: int, radius: float, *, elevation: float = 30.0, step: float = 20.0) -> jaxlie.SE3:
+    """Test views: frame j at azimuth `step * j` degrees, at one elevation (paper, section 4.1)."""
+    azimuth = step * jnp.arange(count, dtype=jnp.float32)
+    return on_sphere(azimuth, jnp.full(count, elevation), radius)
+
+
+def _unit(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    return vector / jnp.linalg.norm(vector, axis=-1, keepdims=True)

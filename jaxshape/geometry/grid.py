@@ -1,0 +1,85 @@
+"""Voxel frames: where a grid of occupancy lies in the object frame.
+
+Grids are indexed `[x, y, z]`. In voxel coordinates, voxel `i` covers `[i, i + 1)` along each
+axis and its centre is at `i + 0.5`.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+RESOLUTION = 32
+"""Voxels along each axis of every grid (paper, section 2.2)."""
+
+MARGIN = 1.0
+"""Voxels left free on each side of the object: room for noise, and for a closed surface."""
+
+
+class GridFrame(NamedTuple):
+    """Maps the object frame to voxel coordinates, each axis with its own scale.
+
+    `voxel = (point - origin) / voxel_size`. Leading axes are batch axes.
+    """
+
+    origin: Float[Array, "*batch 3"]
+    """Object-frame position of voxel coordinate (0, 0, 0), in metres."""
+    voxel_size: Float[Array, "*batch 3"]
+    """Edge lengths of one voxel, in metres."""
+
+
+def fit_box(
+    lower: Float[Array, "*batch 3"],
+    upper: Float[Array, "*batch 3"],
+    *,
+    resolution: int = RESOLUTION,
+    margin: float = MARGIN,
+) -> GridFrame:
+    """Scale each axis on its own so that the box fills the grid up to the margin.
+
+    The anisotropic scaling and shift of the paper, section 2.3: made once per object, from its
+    CAD model or its given box, then applied unchanged to every partial view. `lower` and `upper`
+    are opposite corners in the object frame, in metres.
+    """
+    voxel_size = (upper - lower) / (resolution - 2 * margin)
+    return GridFrame(lower - margin * voxel_size, voxel_size)
+
+
+def fit_box_isotropic(
+    lower: Float[Array, "*batch 3"],
+    upper: Float[Array, "*batch 3"],
+    *,
+    resolution: int = RESOLUTION,
+    margin: float = MARGIN,
+) -> GridFrame:
+    """One scale for all axes: the longest side fills the grid, the others are centred.
+
+    What the paper uses on real data (section 3.1), where only the measured points are known.
+    """
+    half_side = jnp.max(upper - lower, axis=-1, keepdims=True) / 2
+    centre = (lower + upper) / 2
+    return fit_box(centre - half_side, centre + half_side, resolution=resolution, margin=margin)
+
+
+def voxel_from_object(
+    frame: GridFrame, points: Float[Array, "*batch n 3"]
+) -> Float[Array, "*batch n 3"]:
+    """Object-frame points, in metres, to voxel coordinates."""
+    return (points - frame.origin[..., None, :]) / frame.voxel_size[..., None, :]
+
+
+def object_from_voxel(
+    frame: GridFrame, voxels: Float[Array, "*batch n 3"]
+) -> Float[Array, "*batch n 3"]:
+    """Voxel coordinates to object-frame points, in metres."""
+    return frame.origin[..., None, :] + voxels * frame.voxel_size[..., None, :]
+
+
+def voxel_centers(frame: GridFrame, resolution: int = RESOLUTION) -> Float[Array, "*batch n 3"]:
+    """Object-frame centres of all `n = resolution**3` voxels, in the order of a raveled grid."""
+    axis = jnp.arange(resolution) + 0.5
+    centers = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    batch = frame.origin.shape[:-1]
+    return object_from_voxel(
+        frame, jnp.broadcast_to(centers.reshape(-1, 3), (*batch, axis.size**3, 3))
+    )

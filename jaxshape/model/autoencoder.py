@@ -1,0 +1,164 @@
+"""The auto-encoder of the paper (section 2.2): 32^3 occupancy to a short code and back.
+
+`encode` and `decode` are pure functions of the parameters and broadcast over leading axes. The
+parameters are the two Flax collections `params` and `batch_stats` of `AutoEncoder`; Flax itself is
+imported here and nowhere else.
+"""
+
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.model.convolution import KERNEL_SIZE, downsample, upsample
+
+CODES_AT_A_TIME = 2
+"""Codes or grids that go through the network together on CPU, so that layers stay in cache."""
+
+LEAKY_SLOPE = 0.2
+"""Not given in the paper; that of the networks whose initialisation it uses (DCGAN)."""
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Sizes of the auto-encoder; the paper gives them in a figure that is lost."""
+
+    encoder: tuple[int, int, int, int] = (32, 64, 128, 256)
+    """Channels after each of the four strided convolutions."""
+    decoder: tuple[int, int, int] = (128, 64, 32)
+    """Channels after each transposed convolution but the last, which has one."""
+    code: int = 100
+    """Dimension of the code (paper: 100)."""
+
+
+class AutoEncoder(nn.Module):
+    """Encoder and decoder without skip connections, so that either can be used alone."""
+
+    architecture: Architecture = Architecture()
+    dtype: jnp.dtype = jnp.float32
+    """Of the convolutions' arithmetic; parameters and batch statistics stay float32."""
+
+    def setup(self):
+        self.encoder = Encoder(self.architecture, self.dtype)
+        self.decoder = Decoder(self.architecture, self.dtype)
+
+    def __call__(self, grid: Float[Array, "b x y z"], train: bool) -> Float[Array, "b x y z"]:
+        """Logits of the completed grid."""
+        return self.decoder(self.encoder(grid, train), train)
+
+    def encode(self, grid: Float[Array, "b x y z"], train: bool = False) -> Float[Array, "b d"]:
+        return self.encoder(grid, train)
+
+    def decode(self, code: Float[Array, "b d"], train: bool = False) -> Float[Array, "b x y z"]:
+        return self.decoder(code, train)
+
+
+class Encoder(nn.Module):
+    """32 -> 16 -> 8 -> 4 -> 2 by strided convolutions, then pooling and a 1^3 convolution."""
+
+    architecture: Architecture
+    dtype: jnp.dtype
+
+    @nn.compact
+    def __call__(self, grid, train):
+        x = grid[..., None].astype(self.dtype)
+        for i, channels in enumerate(self.architecture.encoder):
+            x = downsample(x, _kernel(self, f"conv{i}", x.shape[-1], channels).astype(self.dtype))
+            x = _normalize(x, train, f"norm{i}")
+        pooled = jnp.mean(x.astype(jnp.float32), axis=(1, 2, 3))
+        return nn.Dense(self.architecture.code, kernel_init=WEIGHT_INIT, name="project")(pooled)
+
+
+class Decoder(nn.Module):
+    """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions."""
+
+    architecture: Architecture
+    dtype: jnp.dtype
+
+    @nn.compact
+    def __call__(self, code, train):
+        channels = (*self.architecture.decoder, 1)
+        # On a single voxel, padding 1 and output padding 1 give 4 voxels: taps 1 to 4 of five.
+        kernel = _kernel(self, "conv0", channels[0], code.shape[-1])[1:, 1:, 1:]
+        x = jnp.einsum("bd,xyzcd->bxyzc", code.astype(self.dtype), kernel.astype(self.dtype))
+        for i in range(1, len(channels)):
+            x = _normalize(x, train, f"norm{i - 1}")
+            x = upsample(x, _kernel(self, f"conv{i}", channels[i], x.shape[-1]).astype(self.dtype))
+        bias = self.param("bias", nn.initializers.zeros, ())
+        # The output layer is (tanh(x) + 1) / 2 = sigmoid(2 x); 2 x is its logit.
+        return 2.0 * (x[..., 0].astype(jnp.float32) + bias)
+
+
+WEIGHT_INIT = nn.initializers.normal(0.02)
+"""Convolutions start at N(0, 0.02) (paper, section 2.3)."""
+
+
+def _kernel(module, name, fine, coarse):
+    return module.param(name, WEIGHT_INIT, (*[KERNEL_SIZE] * 3, fine, coarse))
+
+
+def _normalize(x, train, name):
+    """Batch normalisation, scales started at N(1, 0.02) (paper, section 2.3), and leaky relu."""
+    norm = nn.BatchNorm(
+        use_running_average=not train,
+        momentum=0.9,
+        scale_init=lambda *args: 1 + WEIGHT_INIT(*args),
+        dtype=x.dtype,
+        name=name,
+    )
+    return nn.leaky_relu(norm(x), LEAKY_SLOPE)
+
+
+def initialize(key: PRNGKeyArray, architecture: Architecture = Architecture()) -> PyTree:
+    """Parameters and batch statistics of an untrained network."""
+    grid = jnp.zeros((1, *[RESOLUTION] * 3))
+    return AutoEncoder(architecture).init(key, grid, train=False)
+
+
+def architecture_of(params: PyTree) -> Architecture:
+    """Read the sizes off the parameters."""
+    encoder, decoder = params["params"]["encoder"], params["params"]["decoder"]
+    return Architecture(
+        encoder=tuple(encoder[f"conv{i}"].shape[-1] for i in range(4)),
+        decoder=tuple(decoder[f"conv{i}"].shape[-2] for i in range(3)),
+        code=decoder["conv0"].shape[-1],
+    )
+
+
+def encode(
+    params: PyTree,
+    grid: Bool[Array, "*batch x y z"] | Float[Array, "*batch x y z"],
+    *,
+    dtype: jnp.dtype = jnp.float32,
+) -> Float[Array, "*batch d"]:
+    """The code of a (partial) occupancy grid: the first code of a search (paper, section 3.1)."""
+    network = AutoEncoder(architecture_of(params), dtype)
+    apply = lambda grid: network.apply(params, grid, method="encode")  # noqa: E731
+    return _over_leading_axes(apply, grid.astype(jnp.float32), 3)
+
+
+def decode(
+    params: PyTree, code: Float[Array, "*batch d"], *, dtype: jnp.dtype = jnp.float32
+) -> Float[Array, "*batch x y z"]:
+    """**Logits** of the occupancy that a code stands for; occupied where positive.
+
+    The paper's output in (0, 1) is `jax.nn.sigmoid(logits)`. However many leading axes the codes
+    have, they are decoded by one call; on CPU it works through them a few at a time, so that its
+    memory does not grow with the population.
+    """
+    network = AutoEncoder(architecture_of(params), dtype)
+    apply = lambda code: network.apply(params, code, method="decode")  # noqa: E731
+    return _over_leading_axes(apply, code, 1)
+
+
+def _over_leading_axes(function, x, core_axes):
+    """Apply a function of `[b, ...]` to any leading axes, on CPU a few examples at a time."""
+    batch, core = x.shape[: x.ndim - core_axes], x.shape[x.ndim - core_axes :]
+    flat = x.reshape(-1, *core)
+    one = lambda x: function(x[None])[0]  # noqa: E731
+    in_chunks = lambda flat: lax.map(one, flat, batch_size=CODES_AT_A_TIME)  # noqa: E731
+    out = lax.platform_dependent(flat, cpu=in_chunks, default=function)
+    return out.reshape(*batch, *out.shape[1:])

@@ -1,0 +1,131 @@
+"""Score refinement methods on meshes seen along an orbit (paper, section 4.1). [host]"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxshape.data.capture import camera_distance, capture, measure_frames
+from jaxshape.data.dataset import hash_seed
+from jaxshape.data.meshes import Model
+from jaxshape.geometry import camera, fusion
+from jaxshape.model.weights import ShapePrior
+from jaxshape.refine.reconstruction import (
+    Method,
+    RefineConfig,
+    reconstruct_jit,
+    refiner_for,
+    require_measured,
+)
+from jaxshape.results.metrics import bounds, iou, shape_scores
+
+OBJECTS_AT_A_TIME = 16
+"""Objects refined together: enough to fill a machine, few enough to show progress."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """What decides the figures of an evaluation, besides the meshes and the weights."""
+
+    frames: tuple[int, ...] = (1, 4, 8, 18)
+    """Numbers of frames to fuse: the first k of the orbit."""
+    methods: tuple[Method, ...] = ("encoder", "gradient", "cma")
+    noise: bool = False
+    """Add the faults of a real sensor to the depth images."""
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    seed: int = 0
+
+
+class Case(NamedTuple):
+    """One object after one number of frames; batched over both."""
+
+    occupied: Bool[Array, "*case x y z"]
+    occluded: Bool[Array, "*case x y z"]
+    surface: Bool[Array, "*case x y z"]
+
+
+def observe(model: Model, config: EvaluateConfig) -> Case:
+    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k asked for."""
+    mesh = model.mesh
+    # Independent of the other meshes, so that a mesh scores the same in any company.
+    seed = hash_seed(config.seed, *model.name.encode())
+    T_object_camera = camera.orbit(max(config.frames), camera_distance(mesh))
+    captured = capture(mesh, T_object_camera, noise=config.noise, seed=seed)
+    merged = fusion.merge_cumulative(measure_frames(captured))
+    chosen = jax.tree.map(lambda x: x[np.array(config.frames) - 1], merged)
+    occupied = fusion.occupied(chosen)
+    require_measured(occupied)
+    surface = jnp.broadcast_to(captured.surface, occupied.shape)
+    return Case(occupied, fusion.occluded(chosen), surface)
+
+
+def evaluate(
+    prior: ShapePrior, models: Sequence[Model], config: EvaluateConfig
+) -> Iterator[dict[str, Any]]:
+    """Yield the scores of each mesh in turn, as they go under `per_mesh` into the results file.
+
+    Meshes are refined in batches; the last batch is filled up with its own first cases so that
+    one compiled program serves all.
+    """
+    run = {
+        method: reconstruct_jit(refiner_for(method, prior, config.refine), config.refine)
+        for method in config.methods
+    }
+    group = max(1, OBJECTS_AT_A_TIME // len(config.frames))
+    size = min(group, len(models)) * len(config.frames)
+    for start in range(0, len(models), group):
+        chosen = models[start : start + group]
+        cases = jax.tree.map(lambda *x: jnp.concatenate(x), *[observe(m, config) for m in chosen])
+        filled = jax.tree.map(lambda x: jnp.resize(x, (size, *x.shape[1:])), cases)
+        key = jax.random.key(config.seed)
+        found = {
+            method: jax.device_get(run[method](key, prior, filled.occupied, filled.occluded))
+            for method in config.methods
+        }
+        cases = jax.device_get(cases)
+        for i, model in enumerate(chosen):
+            rows = range(i * len(config.frames), (i + 1) * len(config.frames))
+            frames = {
+                str(k): _scores(jax.tree.map(lambda x, row=row: x[row], cases), found, row)
+                for k, row in zip(config.frames, rows, strict=True)
+            }
+            yield {"name": model.name, "metadata": model.metadata, "frames": frames}
+
+
+def _scores(case: Case, found: dict[str, Any], row: int) -> dict[str, Any]:
+    scores: dict[str, Any] = {}
+    for method, result in found.items():
+        shape = shape_scores(result.completed[row], case.surface)
+        scores[method] = {
+            "iou": shape.iou,
+            "iou_composed": float(iou(result.composed[row], case.surface)),
+            "chamfer_l1": shape.chamfer_l1,
+            "f_score": shape.f_score,
+            "objective": float(result.objective[row]),
+        }
+    limits = bounds(case.occupied, case.occluded, case.surface)
+    scores["bounds"] = {name: float(value) for name, value in limits._asdict().items()}
+    return scores
+
+
+def summarize(per_mesh: Sequence[dict[str, Any]], config: EvaluateConfig) -> dict[str, Any]:
+    """Means over meshes: `means[k][method][score]`, and the bounds."""
+    return {
+        str(k): {
+            method: {
+                score: float(np.mean([m["frames"][str(k)][method][score] for m in per_mesh]))
+                for score in per_mesh[0]["frames"][str(k)][method]
+            }
+            for method in (*config.methods, "bounds")
+        }
+        for k in config.frames
+    }
+
+
+def as_json(config: EvaluateConfig) -> dict[str, Any]:
+    """The settings as plain values."""
+    return asdict(config)

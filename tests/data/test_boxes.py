@@ -1,0 +1,98 @@
+import json
+
+import numpy as np
+import pytest
+
+from jaxshape.data.boxes import points_in_box, read_box
+from jaxshape.data.sequences import SequenceError
+
+
+def turned(degrees, *t):
+    """Object at `t` in the world, turned about its own +y."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    T = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
+    T[:3, 3] = t
+    return T
+
+
+def box_file(folder, content):
+    path = folder / "box.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def test_points_are_inside_if_they_are_in_the_object_frame(tmp_path):
+    T, size = turned(30, 1, 2, 3), np.array([0.4, 1.0, 0.6])
+    hole = {"min": [-1, 0.2, 0.1], "max": [1, 1, 1]}
+    content = {"T_world_object": T.tolist(), "size": size.tolist(), "exclude": [hole]}
+    box = read_box(box_file(tmp_path, content))
+    p_object = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 50, 3))
+    p_world = p_object @ T[:3, :3].T + T[:3, 3]
+
+    def inside(p):
+        in_box = all(abs(p[i]) <= size[i] / 2 for i in range(3))
+        return in_box and not all(hole["min"][i] <= p[i] <= hole["max"][i] for i in range(3))
+
+    expected = np.array([[inside(p) for p in row] for row in p_object])
+    found = points_in_box(p_world, box)
+    assert 50 < expected.sum() < 950
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("handedness", [1, -1])
+def test_a_level_file_gives_a_right_handed_upright_box(tmp_path, handedness):
+    """World: OpenCV camera axes. Level: X right, h up, Y ahead (or, left-handed, behind)."""
+    world_to_level = np.array(
+        [[1, 0, 0, 0.5], [0, 0, handedness, 0], [0, -1, 0, 1.2], [0, 0, 0, 1.0]]
+    )
+    ranges = {"X": [1, 2], "Y": [3, 3.4], "h": [0, 0.8]}
+    content = {"world_to_level": world_to_level.tolist(), "chair_box_level": ranges}
+    box = read_box(box_file(tmp_path, content))
+    R = box.T_world_object[:3, :3]
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) > 0
+    np.testing.assert_allclose(R @ (0, 1, 0), (0, -1, 0), atol=1e-12)  # up is against world y
+    np.testing.assert_allclose(R @ (0, 0, 1), (1, 0, 0), atol=1e-12)  # front is level X
+
+    p_level = np.random.default_rng(0).uniform((0.5, 2.5, -0.5), (2.5, 4, 1.2), (2000, 3))
+    p_world = (p_level - world_to_level[:3, 3]) @ np.linalg.inv(world_to_level[:3, :3]).T
+    low, high = np.array(list(ranges.values())).T
+    expected = ((low <= p_level) & (p_level <= high)).all(axis=1)
+    np.testing.assert_array_equal(points_in_box(p_world, box), expected)
+
+
+def test_a_rule_in_words_is_not_silently_dropped(tmp_path):
+    content = {
+        "world_to_level": np.eye(4).tolist(),
+        "chair_box_level": {"X": [0, 1], "Y": [0, 1], "h": [0, 1]},
+        "exclude_level": "X > 0.5",
+    }
+    with pytest.warns(UserWarning, match="exclude_level is a rule in words and is not applied"):
+        read_box(box_file(tmp_path, content))
+
+
+GOOD = {"T_world_object": np.eye(4).tolist(), "size": [1, 1, 1]}
+
+
+@pytest.mark.parametrize(
+    "content, said",
+    [
+        ("{", "cannot be read as JSON"),
+        ("[]", "holds a JSON list"),
+        ({"size": [1, 1, 1]}, "gives None as T_world_object"),
+        ({**GOOD, "size": [1, 1]}, r"gives \[1, 1\] as size; expected numbers of shape \(3,\)"),
+        ({**GOOD, "size": [1, -1, 1]}, "expected positive extents"),
+        ({**GOOD, "size": ["a", 1, 1]}, "as size"),
+        ({**GOOD, "exclude": [{"min": [0, 0, 0]}]}, "gives None as max"),
+        ({**GOOD, "exclude": {"min": [0, 0, 0], "max": [1, 1, 1]}}, "exclude"),
+        ({**GOOD, "T_world_object": np.diag([1.0, 1, -1, 1]).tolist()}, "mirrors"),
+    ],
+)
+def test_faults_are_named(tmp_path, content, said):
+    with pytest.raises(SequenceError, match=said):
+        read_box(box_file(tmp_path, content))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(SequenceError, match="box.json cannot be read"):
+        read_box(tmp_path / "box.json")

@@ -1,0 +1,361 @@
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+
+from jaxshape.data import archives
+from jaxshape.data.meshes import (
+    Model,
+    Skipped,
+    canonical,
+    list_meshes,
+    load,
+    lying_on_its_side,
+    read_meshes,
+    sample_surface,
+)
+
+SIZE = (0.4, 0.9, 0.5)
+OFF = trimesh.creation.box(SIZE).export(file_type="off")
+OBJ = trimesh.creation.box(SIZE).export(file_type="obj")
+
+
+def asymmetric():
+    """Four corners: the origin and one on each axis, at 1 on x, 2 on y, 3 on z."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], float)
+    return trimesh.Trimesh(vertices, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], process=False)
+
+
+def one(path, **axes):
+    (source,) = list_meshes(path)
+    return load(source, **axes)
+
+
+def archive(path, members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+    return path
+
+
+# Formats
+
+
+@pytest.mark.parametrize("suffix", ["obj", "off", "ply", "glb", "stl", "OBJ"])
+def test_every_format_gives_the_same_centred_triangles(tmp_path, suffix):
+    mesh = asymmetric()
+    (tmp_path / f"part.{suffix}").write_bytes(_bytes(mesh.export(file_type=suffix.lower())))
+    model = one(tmp_path / f"part.{suffix}")
+    assert isinstance(model, Model) and model.name == "part"
+    np.testing.assert_allclose(model.mesh.triangles, mesh.triangles - [0.5, 1, 1.5], atol=1e-6)
+
+
+def _bytes(content):
+    return content.encode() if isinstance(content, str) else content
+
+
+def test_gltf_finds_its_buffer_beside_it_on_disk_and_in_an_archive(tmp_path):
+    files = trimesh.Scene(asymmetric()).export(file_type="gltf")
+    assert len(files) > 1  # the header and its buffers
+    (tmp_path / "disk").mkdir()
+    for name, content in files.items():
+        (tmp_path / "disk" / name).write_bytes(content)
+    archive(tmp_path / "all.zip", {f"kit/{name}": content for name, content in files.items()})
+    for path in (tmp_path / "disk", tmp_path / "all.zip"):
+        np.testing.assert_allclose(one(path).mesh.extents, [1, 2, 3], atol=1e-6)
+
+
+def test_a_scene_is_flattened_with_its_transforms(tmp_path):
+    scene = trimesh.Scene()
+    seat = trimesh.creation.box((0.4, 0.1, 0.4))
+    scene.add_geometry(seat, transform=trimesh.transformations.translation_matrix([0, 0.5, 0]))
+    scene.add_geometry(seat, transform=trimesh.transformations.translation_matrix([0, 1.5, 0]))
+    scene.export(tmp_path / "two.glb")
+    model = one(tmp_path / "two.glb")
+    assert len(model.mesh.faces) == 24
+    np.testing.assert_allclose(model.mesh.extents, [0.4, 1.1, 0.4], atol=1e-6)
+
+
+@pytest.mark.parametrize("header", ["OFF\n", "OFF", "OFF ", "# comment\nOFF\n"])
+def test_modelnet_headers(tmp_path, header):
+    (tmp_path / "chair_0001.off").write_text(header + OFF.removeprefix("OFF").lstrip())
+    np.testing.assert_allclose(one(tmp_path).mesh.extents, SIZE)
+
+
+# Trees and archives
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        "03001627/1a6f615e8b1b5ae4dbbc9440457e303e/model.obj",
+        "03001627/1a6f615e8b1b5ae4dbbc9440457e303e/models/model_normalized.obj",
+        "chair/train/chair_0001.off",
+    ],
+)
+def test_known_trees_are_named_by_their_paths_in_folders_and_zips(tmp_path, member):
+    content = OFF if member.endswith("off") else OBJ
+    file = tmp_path / "tree" / member
+    file.parent.mkdir(parents=True)
+    file.write_text(content)
+    archive(tmp_path / "tree.zip", {member: content})
+    name = member.rsplit(".", 1)[0]
+    assert one(tmp_path / "tree").name == one(tmp_path / "tree.zip").name == name
+    both = {source.name for source in list_meshes(tmp_path)}
+    assert both == {f"tree/{member}", f"tree.zip/{member}"}
+
+
+def test_listing_is_sorted_picklable_and_opens_nothing(tmp_path):
+    for name in ("b.obj", "a.off", "c/a.ply", ".hidden.obj", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("not a mesh")
+    sources = list_meshes(tmp_path)
+    assert [source.name for source in sources] == ["a", "b", "c/a"]
+    assert pickle.loads(pickle.dumps(sources)) == sources
+    assert len(pickle.dumps(sources[0])) < 1000
+
+
+def test_equal_names_keep_their_suffix(tmp_path):
+    for name in ("a.obj", "a.ply", "b.obj"):
+        (tmp_path / name).write_text(OBJ)
+    assert [source.name for source in list_meshes(tmp_path)] == ["a.obj", "a.ply", "b"]
+
+
+CATALOGUE = """
+# A comment
+license=CC-BY \\
+    3.0
+name#1=Oak \\u00e9 chair
+creator#1=Somebody
+model#1=/oak/oak.obj
+modelRotation#1=0 0 1 0 1 0 -1 0 0
+width#1=300
+height#1=400
+depth#1=100
+name#2=Plain
+model#2=/plain.obj
+"""
+
+
+def test_a_furniture_catalogue_turns_scales_and_credits(tmp_path):
+    obj = asymmetric().export(file_type="obj")
+    members = {"PluginFurnitureCatalog.properties": CATALOGUE, "oak/oak.obj": obj}
+    path = archive(tmp_path / "kit.sh3f", members | {"plain.obj": obj, "oak/icon.png": "x"})
+    oak, plain = read_meshes(path)
+    assert (oak.name, plain.name) == ("oak/oak", "plain")
+    assert oak.metadata["name"] == "Oak é chair" and oak.metadata["creator"] == "Somebody"
+    assert oak.metadata["license"] == plain.metadata["license"] == "CC-BY 3.0"
+    np.testing.assert_allclose(plain.mesh.extents, [1, 2, 3])
+    # the rotation takes x to -z and z to x; 3 x 2 x 1 is then stretched to 3 x 4 x 1 metres
+    np.testing.assert_allclose(oak.mesh.extents, [3, 4, 1])
+    np.testing.assert_allclose(
+        oak.mesh.vertices, [[-1.5, -2, 0.5], [-1.5, -2, -0.5], [-1.5, 2, 0.5], [1.5, -2, 0.5]]
+    )
+
+
+# Axes
+
+
+def test_axes_are_turned_to_up_y_and_front_z():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], float)
+    for up, front, expected in [
+        ("y", "z", [(1, 0, 0), (0, 2, 0), (0, 0, 3)]),
+        ("z", "-y", [(1, 0, 0), (0, 0, -2), (0, 3, 0)]),  # Blender, ModelNet
+        ("y", "-z", [(-1, 0, 0), (0, 2, 0), (0, 0, -3)]),
+        ("x", "z", [(0, 1, 0), (-2, 0, 0), (0, 0, 3)]),
+    ]:
+        mesh = canonical(trimesh.Trimesh(vertices, [[1, 2, 3], [0, 1, 2]], process=False),
+                         up=up, front=front)  # fmt: skip
+        np.testing.assert_allclose(mesh.vertices[1:] - mesh.vertices[0], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+@pytest.mark.parametrize("front", ["x", "y", "z", "-x", "-y", "-z"])
+def test_turning_is_a_rotation_that_centres_or_an_error(up, front):
+    mesh = asymmetric()
+    if up[-1] == front[-1]:
+        with pytest.raises(ValueError, match="perpendicular"):
+            canonical(mesh, up=up, front=front)
+        return
+    turned = canonical(mesh, up=up, front=front)
+    np.testing.assert_allclose(turned.volume, mesh.volume)  # not mirrored, not scaled
+    np.testing.assert_allclose(turned.bounds.sum(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(turned.extents[1], mesh.extents["xyz".index(up[-1])])
+
+
+def test_an_axis_that_is_none_is_an_error(tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ)
+    with pytest.raises(ValueError, match="up must be one of .* 'up'"):
+        canonical(asymmetric(), up="up")
+    with pytest.raises(ValueError, match="perpendicular"):
+        read_meshes(tmp_path, up="z")
+
+
+# What is broken
+
+
+def stl(triangles):
+    return trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles)).export(file_type="stl")
+
+
+PLATE = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("a.obj", "", "empty"),
+        ("a.obj", "\n\n", "empty"),
+        ("a.obj", "# only words\n", None),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 1\n", None),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 9\n", "unreadable"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 1 2\n", "no faces"),
+        ("a.off", "OFF\n3 1 0\nnan nan nan\n1 0 0\n0 1 1\n3 0 1 2\n", "not finite"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1e200 0 0\n0 1e200 1\n3 0 1 2\n", "not finite"),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 1\n3 0 1 5\n", "unreadable"),
+        ("a.off", "OFF\n900000000 9 0\n0 0 0\n", "unreadable"),
+        ("a.off", OFF[: len(OFF) // 3], "unreadable"),
+        ("a.off", "FOO\n1 2 3\n", "unreadable"),
+        ("a.off", PLATE, "flat"),
+        ("a.ply", trimesh.creation.box().export(file_type="ply")[:300], "unreadable"),
+        ("a.ply", b"\x89PNG\r\n", "unreadable"),
+        ("a.glb", trimesh.creation.box().export(file_type="glb")[:500], "unreadable"),
+        ("a.glb", b"glTF" + bytes(40), "unreadable"),
+        ("a.gltf", '{"asset": {"version": "2.0"}}', None),
+        ("a.stl", trimesh.creation.box().export(file_type="stl")[:300], "unreadable"),
+        ("a.zip", b"PK\x03\x04 and then junk", "unreadable"),
+        ("a.sh3f", b"", "unreadable"),
+    ],
+)
+def test_broken_files_are_skipped_with_a_reason(tmp_path, name, content, reason):
+    (tmp_path / name).write_bytes(_bytes(content))
+    skipped = one(tmp_path)
+    assert isinstance(skipped, Skipped)
+    assert skipped.reason == reason or reason is None
+    assert skipped.reason in {"unreadable", "empty", "no faces", "not finite", "flat"}
+    assert skipped.name == "a" and skipped.detail
+
+
+def test_faces_with_a_vertex_that_is_not_a_number_are_dropped_alone(tmp_path):
+    lines = OFF.rstrip().splitlines()
+    lines[1] = "9 13 0"
+    lines.insert(2 + 8, "nan nan nan")
+    lines.append("3 0 1 8")
+    (tmp_path / "a.off").write_text("\n".join(lines))
+    model = one(tmp_path)
+    assert len(model.mesh.faces) == 12
+    np.testing.assert_allclose(model.mesh.extents, SIZE)
+
+
+def test_one_broken_mesh_does_not_stop_the_others(tmp_path):
+    path = archive(tmp_path / "a.zip", {"a.obj": OBJ, "b.obj": "junk", "c.obj": OBJ, "d.txt": "x"})
+    with zipfile.ZipFile(path) as file:
+        position = file.getinfo("c.obj").header_offset + 60
+    content = bytearray(path.read_bytes())
+    content[position : position + 20] = bytes(20)  # the member no longer inflates to its checksum
+    path.write_bytes(content)
+    kinds = [type(result) for result in read_meshes(path)]
+    assert kinds == [Model, Skipped, Skipped]
+
+
+def test_names_from_archives_stay_below_the_folder_they_are_joined_to(tmp_path):
+    names = ["../../evil.obj", "/etc/evil.obj", "c:\\evil.obj", "../evil.obj"]
+    path = archive(tmp_path / "a.zip", dict.fromkeys(names, OBJ))
+    models = list(read_meshes(path))
+    assert len({model.name for model in models}) == len(models) == 4
+    for model in models:
+        assert isinstance(model, Model)
+        target = (tmp_path / "out" / model.name).resolve()
+        assert target.is_relative_to(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == [path]  # nothing was unpacked
+
+
+def test_a_mesh_cannot_refer_to_files_outside_its_folder(tmp_path):
+    files = trimesh.Scene(asymmetric()).export(file_type="gltf")
+    (tmp_path / "inside").mkdir()
+    header = files.pop("model.gltf")
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        header = header.replace(f'"{name}"'.encode(), f'"../{name}"'.encode())
+    (tmp_path / "inside" / "model.gltf").write_bytes(header)
+    skipped = one(tmp_path / "inside")
+    assert skipped.reason == "unreadable" and "outside its own folder" in skipped.detail
+
+
+def test_members_that_inflate_too_far_are_too_large(tmp_path, monkeypatch):
+    monkeypatch.setattr(archives, "MAX_BYTES", 100_000)
+    bomb = archive(tmp_path / "bomb.zip", {"a.obj": "\n" * 10_000_000, "b.obj": OBJ})
+    assert bomb.stat().st_size < 100_000
+    large, good = read_meshes(bomb)
+    assert large.reason == "too large" and isinstance(good, Model)
+    (tmp_path / "c.obj").write_bytes(bytes(200_000))
+    assert one(tmp_path / "c.obj").reason == "too large"
+
+
+def test_nothing_to_read_says_what_was_looked_for(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no file or folder .*nowhere"):
+        list_meshes(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=r"no mesh: looked for .*\.obj"):
+        list_meshes(tmp_path)
+    (tmp_path / "a.blend").write_text("x")
+    with pytest.raises(ValueError, match="no mesh"):
+        list_meshes(tmp_path / "a.blend")
+
+
+# Sampling
+
+
+def test_samples_lie_on_the_surface_in_proportion_to_area():
+    mesh = trimesh.creation.box((1, 2, 3))
+    points = sample_surface(mesh, 6000, seed=0)
+    on_face = np.isclose(np.abs(points), mesh.extents / 2)
+    assert points.shape == (6000, 3) and (on_face.sum(axis=1) == 1).all()
+    np.testing.assert_allclose(on_face.sum(axis=0) / 6000 * 22, [12, 6, 4], atol=0.02)
+    inside = points[on_face[:, 0], 1]  # uniform over a face: mean 0, variance of a 2 m interval
+    assert abs(inside.mean()) < 0.03 and abs(inside.var() - 1 / 3) < 0.02
+
+
+def test_samples_depend_on_the_seed_alone():
+    mesh = trimesh.creation.icosphere()
+    np.testing.assert_array_equal(sample_surface(mesh, 100, 3), sample_surface(mesh, 100, 3))
+    assert not np.array_equal(sample_surface(mesh, 100, 3), sample_surface(mesh, 100, 4))
+
+
+def test_a_wire_with_two_points_worth_of_area_is_always_hit():
+    plate = trimesh.creation.box((1, 0.01, 1))
+    wire = trimesh.creation.box((0.001, 0.3, 0.001)).apply_translation([0, 1, 0])
+    both = trimesh.util.concatenate([plate, wire])
+    count = int(np.ceil(2 * both.area / wire.area))
+    for seed in range(10):
+        assert (sample_surface(both, count, seed)[:, 1] > 0.5).any()
+
+
+# Orientation
+
+
+def box_chair():
+    def part(size, at):
+        return trimesh.creation.box(size).apply_translation(at)
+
+    legs = [part((0.04, 0.45, 0.04), (x, 0.225, z)) for x in (-0.2, 0.2) for z in (-0.2, 0.2)]
+    seat, back = part((0.44, 0.04, 0.44), (0, 0.47, 0)), part((0.44, 0.45, 0.03), (0, 0.72, -0.2))
+    return canonical(trimesh.util.concatenate([*legs, seat, back]))
+
+
+@pytest.mark.parametrize("front", ["z", "-z", "x", "-x"])
+def test_a_standing_chair_is_left_alone_whichever_way_it_looks(front):
+    assert not lying_on_its_side(canonical(box_chair(), front=front))
+
+
+@pytest.mark.parametrize("up", ["-y", "x", "-x", "z", "-z"])
+@pytest.mark.parametrize("front", ["x", "y", "z"])
+def test_a_chair_with_a_wrong_up_axis_is_noticed(up, front):
+    if up[-1] != front:
+        assert lying_on_its_side(canonical(box_chair(), up=up, front=front))
+
+
+@pytest.mark.parametrize("mesh", [trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere()])
+def test_shapes_without_a_clear_up_are_left_alone(mesh):
+    assert not lying_on_its_side(mesh)

@@ -1,0 +1,140 @@
+import numpy as np
+import pytest
+import trimesh
+
+from jaxshape.geometry.grid import GridFrame
+from jaxshape.results.surface import surface, voxel_surface, write_mesh
+
+UNIT = GridFrame(np.zeros(3), np.ones(3))
+
+
+def distance_from_centre(resolution=32):
+    axis = np.arange(resolution) + 0.5 - resolution / 2
+    return np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij")), axis=0)
+
+
+def ball(radius):
+    """Probability 0.5 exactly on the sphere, falling by 1 over four voxels."""
+    return np.clip(0.5 + (radius - distance_from_centre()) / 4, 0, 1)
+
+
+def test_sphere_is_where_it_should_be():
+    mesh = surface(ball(10.0), UNIT)
+    radius = np.linalg.norm(mesh.vertices - 16, axis=1)
+    np.testing.assert_allclose(radius, 10, atol=0.03)
+    assert mesh.is_watertight
+    np.testing.assert_allclose(mesh.volume, 4 / 3 * np.pi * 10**3, rtol=0.01)
+
+
+def test_normals_point_from_occupied_to_free_on_both_sheets_of_a_shell():
+    probability = np.minimum(ball(13.0), 1 - ball(7.0))
+    mesh = surface(probability, UNIT)
+    outward = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles_center - 16)
+    outer = np.linalg.norm(mesh.triangles_center - 16, axis=1) > 10
+    assert (outward[outer] > 0).all() and (outward[~outer] < 0).all()
+    assert len(mesh.split(only_watertight=True)) == 2
+    np.testing.assert_allclose(mesh.volume, 4 / 3 * np.pi * (13**3 - 7**3), rtol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_any_boolean_grid_gives_a_closed_surface_of_positive_volume(seed):
+    occupied = np.random.default_rng(seed).random((8, 9, 10)) < (seed + 1) / 11
+    mesh = surface(occupied, UNIT)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume > 0
+
+
+def test_a_full_grid_closes_at_its_border():
+    mesh = surface(np.ones((4, 4, 4), bool), UNIT)
+    assert mesh.is_watertight
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [4, 4, 4]], atol=1e-5)
+
+
+def test_one_voxel_is_centred_on_its_centre():
+    occupied = np.zeros((4, 5, 6), bool)
+    occupied[1, 2, 4] = True
+    mesh = voxel_surface(occupied)
+    np.testing.assert_allclose(mesh.bounds.mean(axis=0), [1.5, 2.5, 4.5], atol=1e-5)
+    np.testing.assert_allclose(mesh.extents, 1, atol=1e-5)
+
+
+def test_frame_scales_each_axis_and_the_pose_moves_to_the_world():
+    frame = GridFrame(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))
+    T_world_object = np.eye(4)
+    T_world_object[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    T_world_object[:3, 3] = [5, 6, 7]
+    unit, placed = surface(ball(9.0), UNIT), surface(ball(9.0), frame)
+    np.testing.assert_allclose(placed.vertices, unit.vertices * [0.1, 0.2, 0.3] + [1, 2, 3])
+    world = surface(ball(9.0), frame, T_world_object=T_world_object)
+    expected = np.stack(
+        [5 - placed.vertices[:, 1], 6 + placed.vertices[:, 0], 7 + placed.vertices[:, 2]], axis=1
+    )
+    np.testing.assert_allclose(world.vertices, expected)
+    np.testing.assert_allclose(world.volume, placed.volume)
+
+
+def test_smoothing_brings_a_boolean_ball_closer_to_the_sphere_and_keeps_its_volume():
+    occupied = distance_from_centre() < 10
+    rough, smooth = (surface(occupied, UNIT, smoothing=rounds) for rounds in (0, 20))
+
+    def roughness(mesh):
+        return np.linalg.norm(mesh.vertices - 16, axis=1).std()
+
+    assert roughness(smooth) < 0.6 * roughness(rough)
+    np.testing.assert_allclose(smooth.volume, rough.volume, rtol=0.01)
+    assert smooth.is_watertight
+
+
+def test_smoothing_keeps_a_leg_one_voxel_thin():
+    occupied = np.zeros((16, 16, 16), bool)
+    occupied[8, 1:15, 8] = True
+    mesh = surface(occupied, UNIT, smoothing=20)
+    assert mesh.is_watertight and len(mesh.split()) == 1
+    assert mesh.extents[1] > 13
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        (np.zeros((4, 4, 4), bool), "No voxel"),
+        (np.full((4, 4, 4), 0.5), "No voxel"),
+        (np.full((4, 4, 4), np.nan), "not finite"),
+    ],
+)
+def test_grids_without_a_surface_say_so(grid, message):
+    with pytest.raises(ValueError, match=message):
+        surface(grid, UNIT)
+
+
+def test_level_must_be_a_probability():
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        surface(ball(5.0), UNIT, level=0.0)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".PLY"])
+def test_written_meshes_read_back(tmp_path, suffix):
+    mesh = surface(ball(10.0), GridFrame(np.zeros(3), np.full(3, 0.03)))
+    path = tmp_path / "new folder" / f"chair{suffix}"
+    write_mesh(mesh, path)
+    again = trimesh.load_mesh(path, process=False)
+    np.testing.assert_allclose(again.triangles, mesh.triangles, atol=1e-6)
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_unknown_suffix_names_the_three(tmp_path):
+    with pytest.raises(ValueError, match=r"\.ply, \.glb, \.obj.*\.stl"):
+        write_mesh(surface(ball(5.0), UNIT), tmp_path / "chair.stl")
+
+
+def test_a_failed_write_leaves_the_earlier_file(tmp_path, monkeypatch):
+    path = tmp_path / "chair.ply"
+    path.write_bytes(b"earlier")
+
+    def fail(*_, **__):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(trimesh.Trimesh, "export", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_mesh(trimesh.creation.box(), path)
+    assert path.read_bytes() == b"earlier"
+    assert list(tmp_path.iterdir()) == [path]
