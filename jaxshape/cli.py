@@ -23,6 +23,7 @@ from rich.table import Table
 from tyro.conf import Positional, subcommand
 
 console = Console(stderr=True)
+"""Progress, warnings and errors; what a command answers goes to standard output."""
 
 
 @dataclass(frozen=True)
@@ -40,34 +41,78 @@ class Search:
     step_size: float = 0.14
     """Step size of gradient descent."""
 
+    def config(self):
+        """The settings as the library takes them."""
+        from jaxshape.refine.reconstruction import RefineConfig
 
-@dataclass(frozen=True)
-class Demo:
+        _require(self.iterations >= 1, f"--iterations is {self.iterations}; give 1 or more.")
+        _require(self.population >= 3, f"--population is {self.population}; give 3 or more.")
+        return RefineConfig(**vars(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rebuild:
+    """What the commands that rebuild one object have in common."""
+
+    method: Literal["encoder", "gradient", "cma"] = "cma"
+    """How the first code is searched on: not at all, by gradient descent, by CMA-ES."""
+    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
+    weights: Path | None = None
+    """Weights to use instead of those that come with the package."""
+    seed: int = 0
+    """Of all random numbers."""
+
+    def rebuild(
+        self, observation: Any, figures: dict[str, Any], output: Path, start: float
+    ) -> dict[str, Any]:
+        """Encode, search, and write the files of one observed object; returns result.json."""
+        import jax
+        import jax.numpy as jnp
+
+        from jaxshape.model.weights import load_prior
+        from jaxshape.refine.reconstruction import reconstruct_jit, refiner_for, require_measured
+        from jaxshape.results.output import write_result
+
+        require_measured(observation.occupied)
+        prior, config = load_prior(self.weights), self.search.config()
+        with console.status("searching the space of shapes"):
+            grids = jnp.asarray(observation.occupied)[None], jnp.asarray(observation.occluded)[None]
+            run = reconstruct_jit(refiner_for(self.method, prior, config), config)
+            keys = jax.random.key(self.seed)[None]
+            reconstruction = jax.block_until_ready(run(keys, prior, *grids))
+            settings = {"method": self.method, "seed": self.seed, **vars(self.search)}
+            figures = {**figures, **settings, "seconds": round(time.perf_counter() - start, 2)}
+            result = write_result(output, observation, reconstruction, figures)
+        print(
+            f"objective: encoder {result['objective_encoder']:.4f}, "
+            f"refined {result['objective_refined']:.4f} nats per voxel"
+        )
+        print(f"wrote mesh.glb, grid.npz, overview.png, result.json to {output}")
+        return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Rebuild):
     frames: int = 6
     """Depth frames along the orbit, 20 degrees apart."""
     output: Path = Path("out/demo")
     """Folder for mesh.glb, grid.npz, result.json and overview.png."""
-    weights: Path | None = None
-    """Weights to use instead of those that come with the package."""
-    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
-    seed: int = 0
-    """Which chair, and which random numbers."""
 
     def run(self) -> None:
         start = time.perf_counter()
-        import jax
         import numpy as np
 
         from jaxshape.data.capture import camera_distance, capture, measure_frames
-        from jaxshape.data.dataset import TEST_SEEDS, load_object
+        from jaxshape.data.chairs import random_chair
+        from jaxshape.data.dataset import TEST_SEEDS
         from jaxshape.geometry import camera, fusion
         from jaxshape.results.output import Observation
 
         _require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
         _require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
-        model = load_object(TEST_SEEDS + self.seed)
-        T_object_camera = camera.orbit(self.frames, camera_distance(model.mesh))
-        seen = capture(model.mesh, T_object_camera, noise=True, seed=self.seed)
+        mesh = random_chair(TEST_SEEDS + self.seed)
+        T_object_camera = camera.orbit(self.frames, camera_distance(mesh))
+        seen = capture(mesh, T_object_camera, noise=True, seed=self.seed)
         merged = fusion.merge_all(measure_frames(seen))
         observation = Observation(
             depth=list(np.asarray(seen.depth)[:6]),
@@ -78,8 +123,8 @@ class Demo:
             truth=np.asarray(seen.surface),
         )
         figures = {"object": f"procedural chair {TEST_SEEDS + self.seed}", "frames": self.frames}
-        result = _rebuild(self, observation, figures, start, jax.random.key(self.seed))
-        console.print(
+        result = self.rebuild(observation, figures, self.output, start)
+        print(
             f"IoU with the true surface: encoder {result['iou_encoder']:.3f}, "
             f"refined {result['iou_refined']:.3f}, composed {result['iou_composed']:.3f}"
         )
@@ -198,11 +243,11 @@ class Train:
         save_prior(self.output / "weights.safetensors", prior, card)
         with atomic_path(self.output / "card.json") as path:
             path.write_text(json.dumps(card, indent=2))
-        console.print(f"wrote {self.output / 'weights.safetensors'}")
+        print(f"wrote {self.output / 'weights.safetensors'}")
 
 
-@dataclass(frozen=True)
-class Reconstruct:
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct(Rebuild):
     frames: Positional[Path]
     """Folder of frame-N.depth.png, frame-N.pose.txt and camera-intrinsics.txt (7-Scenes layout);
     frame-N.mask.png beside them tells the object from the rest."""
@@ -219,15 +264,9 @@ class Reconstruct:
     """Scale all axes alike, as the paper does on real data, instead of filling the box."""
     output: Path = Path("out/reconstruct")
     """Folder for mesh.glb, grid.npz, result.json and overview.png."""
-    weights: Path | None = None
-    """Weights to use instead of those that come with the package."""
-    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
-    seed: int = 0
-    """Of the search."""
 
     def run(self) -> None:
         start = time.perf_counter()
-        import jax
 
         from jaxshape.data.boxes import read_box
         from jaxshape.data.sequences import open_sequence, poses_look_inverted
@@ -249,15 +288,17 @@ class Reconstruct:
                 sequence, watched, box, min_hits=self.min_hits, isotropic=self.isotropic
             )
         figures = {"object": str(self.frames), "frames": len(chosen)}
-        _rebuild(self, observation, figures, start, jax.random.key(self.seed))
+        self.rebuild(observation, figures, self.output, start)
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    meshes: Path
-    """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
     output: Path
     """JSON file for config, per_mesh and means."""
+    meshes: Path | None = None
+    """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
+    chairs: int = 0
+    """Procedural test chairs to use instead of --meshes."""
     frames: str = "1,4,8,18"
     """Numbers of frames to fuse, with commas: the first k of an orbit in steps of 20 degrees."""
     methods: str = "encoder,gradient,cma"
@@ -277,36 +318,52 @@ class Evaluate:
     def run(self) -> None:
         start = time.perf_counter()
         from jaxshape.data.archives import list_meshes
-        from jaxshape.data.meshes import axes_to_canonical
+        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.meshes import Skipped, axes_to_canonical
         from jaxshape.files import atomic_path
         from jaxshape.model.weights import load_prior
         from jaxshape.refine.reconstruction import METHODS
         from jaxshape.results import evaluation
 
         frames = _numbers(self.frames, "--frames")
-        methods = tuple(self.methods.split(","))
+        methods: Any = tuple(self.methods.split(","))
         for method in methods:
             _require(
                 method in METHODS,
                 f"--methods names {method!r}; choose from {', '.join(METHODS)}, with commas.",
             )
         axes_to_canonical(self.up, self.front)
-        prior, sources = load_prior(self.weights), list_meshes(self.meshes)
+        _require(
+            (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
+            "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",
+        )
+        test_seeds = range(TEST_SEEDS, TEST_SEEDS + self.chairs)
+        sources = list_meshes(self.meshes) if self.meshes else test_seeds
+        prior = load_prior(self.weights)
         config = evaluation.EvaluateConfig(
-            frames, methods, self.noise, _refine_config(self.search), self.seed
+            frames, methods, self.noise, self.search.config(), self.seed
         )
         models, skipped = _load_models(sources, self.up, self.front)
-        per_mesh = []
+        settings = json.dumps([evaluation.as_json(config), vars(self)], default=str, sort_keys=True)
+        per_mesh = evaluation.read_journal(self.output, settings)
+        scored = {scores["name"] for scores in per_mesh}
+        left = [model for model in models if model.name not in scored]
         with progress_bar("meshes") as bar:
-            task = bar.add_task("evaluate", total=len(models), note="")
-            for scores in evaluation.evaluate(prior, models, config):
-                per_mesh.append(scores)
-                bar.update(task, advance=1, note=scores["name"])
+            task = bar.add_task("evaluate", total=len(models), completed=len(scored), note="")
+            for scores in evaluation.evaluate(prior, left, config):
+                if isinstance(scores, Skipped):
+                    skipped.append(scores)
+                    _report_skipped([scores])
+                else:
+                    per_mesh.append(scores)
+                    evaluation.write_journal(self.output, settings, per_mesh)
+                bar.update(task, advance=1)
+        _require(bool(per_mesh), "No mesh could be scored; see the reasons above.")
         means = evaluation.summarize(per_mesh, config)
         content = {
             "config": {
                 **evaluation.as_json(config),
-                "meshes": str(self.meshes),
+                "meshes": str(self.meshes) if self.meshes else f"{self.chairs} procedural chairs",
                 "weights": str(self.weights) if self.weights else "chair (packaged)",
                 "seconds": round(time.perf_counter() - start, 1),
             },
@@ -316,53 +373,21 @@ class Evaluate:
         }
         with atomic_path(self.output) as path:
             path.write_text(json.dumps(content, indent=1))
-        console.print(_table(means, len(per_mesh)))
+        evaluation.remove_journal(self.output)
+        Console().print(_table(means, len(per_mesh)))
 
 
 # ------------------------------------------------------------------ shared by the commands
 
 
-def _rebuild(command: Any, observation: Any, figures: dict, start: float, key: Any) -> dict:
-    """Encode, search by CMA-ES, and write the files of one observed object."""
-    import jax.numpy as jnp
-
-    from jaxshape.model.weights import load_prior
-    from jaxshape.refine.reconstruction import reconstruct_jit, refiner_for, require_measured
-    from jaxshape.results.output import write_result
-
-    require_measured(observation.occupied)
-    prior, config = load_prior(command.weights), _refine_config(command.search)
-    with console.status("searching the space of shapes"):
-        occupied, occluded = jnp.asarray(observation.occupied), jnp.asarray(observation.occluded)
-        reconstruction = reconstruct_jit(refiner_for("cma", prior, config), config)(
-            key, prior, occupied[None], occluded[None]
-        )
-        seconds = round(time.perf_counter() - start, 2)
-        figures = {**figures, "seed": command.seed, "search": vars(command.search)}
-        figures["seconds"] = seconds
-        result = write_result(command.output, observation, reconstruction, figures)
-    console.print(
-        f"objective: encoder {result['objective_encoder']:.4f}, "
-        f"refined {result['objective_refined']:.4f} nats per voxel"
-    )
-    console.print(f"wrote mesh.glb, grid.npz, overview.png, result.json to {command.output}")
-    return result
-
-
-def _refine_config(search: Search):
-    from jaxshape.refine.reconstruction import RefineConfig
-
-    _require(search.iterations >= 1, f"--iterations is {search.iterations}; give 1 or more.")
-    return RefineConfig(**vars(search))
-
-
 def _load_models(sources, up: str, front: str):
     """Load meshes, and refuse a set that seems to lie on its side."""
-    from jaxshape.data.meshes import Skipped, load, lying_on_its_side
+    from jaxshape.data.dataset import load_object
+    from jaxshape.data.meshes import Skipped, lying_on_its_side
 
     with progress_bar("meshes") as bar:
         task = bar.add_task("read", note="")
-        found = [load(s, up=up, front=front) for s in bar.track(sources, task_id=task)]
+        found = [load_object(s, up=up, front=front) for s in bar.track(sources, task_id=task)]
     skipped = [f for f in found if isinstance(f, Skipped)]
     models = [f for f in found if not isinstance(f, Skipped)]
     _report_skipped(skipped)
@@ -489,7 +514,7 @@ def main() -> None:
         command.run()
     except (ValueError, OSError) as problem:
         # Sentences for the user, by the convention of the package; anything else is a bug.
-        console.print(f"[red]jaxshape:[/] {escape(str(problem))}")
+        console.print(f"[red]jaxshape:[/] {escape(str(problem))}", soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         console.print("stopped")

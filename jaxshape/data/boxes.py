@@ -1,7 +1,7 @@
 """The oriented box that tells the object from the room."""
 
 import json
-import warnings
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,8 +44,9 @@ def read_box(path: str | Path) -> Box:
     The file holds `{"T_world_object": 4x4, "size": [x, y, z]}` and may hold
     `"exclude": [{"min": [x, y, z], "max": [x, y, z]}, ...]`, as the fields of `Box`. A file with
     `world_to_level` (4x4, to a frame with z up) and `chair_box_level` (`X`, `Y` and `h`, each
-    lowest and highest) is read as a box whose front looks along the level X; such a file cannot
-    say where the front is, nor exclude anything.
+    lowest and highest) is read as a box whose front looks along the level X, for such a file
+    cannot say where the front is; what its `exclude_level` names, comparisons of X, Y or h with
+    numbers joined by `and`, is left out.
 
     Raises `SequenceError` for anything else.
     """
@@ -84,12 +85,6 @@ def _oriented_box(content: dict[str, Any], path: str | Path) -> Box:
 
 
 def _level_box(content: dict[str, Any], path: str | Path) -> Box:
-    if "exclude_level" in content:
-        warnings.warn(
-            f"{path}: exclude_level is a rule in words and is not applied; write the box with "
-            'T_world_object, size and "exclude" to leave things out.',
-            stacklevel=3,
-        )
     T_level_world = _numbers(content, "world_to_level", (4, 4), path)
     level = content.get("chair_box_level", {})
     x, y, height = (_numbers(level, axis, (2,), path) for axis in ("X", "Y", "h"))
@@ -99,7 +94,34 @@ def _level_box(content: dict[str, Any], path: str | Path) -> Box:
     T_world_object[:3, :3] = np.stack([np.cross(up, front), up, front], axis=1)
     center = np.array([x.mean(), y.mean(), height.mean(), 1.0])
     T_world_object[:, 3] = np.linalg.inv(T_level_world) @ center
-    return Box(T_world_object, size=np.array([np.diff(r)[0] for r in (y, height, x)]))
+    size = np.array([np.diff(r)[0] for r in (y, height, x)])
+    if "exclude_level" not in content:
+        return Box(T_world_object, size)
+    excluded = _level_rule(str(content["exclude_level"]), path)
+    T_object_level = np.linalg.inv(T_world_object) @ np.linalg.inv(T_level_world)
+    # The axes of both frames are parallel, so a box stays one; it may swap its ends.
+    # Far away stands for no limit, as infinity times zero is not a number.
+    corners = excluded @ T_object_level[:3, :3].T + T_object_level[:3, 3]
+    return Box(T_world_object, size, np.sort(corners, axis=0)[None])
+
+
+_FAR = 1e6
+_COMPARISON = re.compile(r"\s*([XYh])\s*([<>])\s*(-?\d+(?:\.\d+)?)\s*")
+
+
+def _level_rule(rule: str, path: str | Path) -> Float[np.ndarray, "2 3"]:
+    """The corners, in the level frame, of what a rule like `X > -0.96 and h > 0.62` excludes."""
+    corners = np.array([[-_FAR] * 3, [_FAR] * 3])
+    for part in re.sub(r"\(.*?\)", "", rule).split(" and "):
+        comparison = _COMPARISON.fullmatch(part)
+        if comparison is None:
+            raise SequenceError(
+                f"{path} gives the rule {rule!r} as exclude_level, of which {part!r} cannot be "
+                "read; write comparisons of X, Y or h with numbers, joined by `and`."
+            )
+        axis, sign, number = comparison.groups()
+        corners[0 if sign == ">" else 1, "XYh".index(axis)] = float(number)
+    return corners
 
 
 def _numbers(

@@ -49,7 +49,7 @@ def capture(
     depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, image_size)
     if noise:
         depth = render.add_sensor_noise(depth, cosine, np.random.default_rng(seed))
-    frame = grid.fit_box(*np.float32(mesh.bounds))
+    frame = grid.fit_box(*jnp.float32(mesh.bounds))
     points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
     return Capture(depth, intrinsics, T_object_camera, frame, discretize(points, frame))
 

@@ -6,10 +6,11 @@ depth is that of the ray's intersection with the plane of that triangle.
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
@@ -44,12 +45,10 @@ def fit_intrinsics(
     mesh: trimesh.Trimesh, T_object_camera: jaxlie.SE3, image_size: int = IMAGE_SIZE
 ) -> Intrinsics:
     """The longest lens with which every view sees the mesh's whole bounding box."""
-    T_camera_object = np.asarray(T_object_camera.inverse().as_matrix(), np.float64)
-    corners = trimesh.bounds.corners(mesh.bounds)
-    seen = corners @ T_camera_object[:, :3, :3].swapaxes(1, 2) + T_camera_object[:, None, :3, 3]
-    x, y, z = np.moveaxis(seen, -1, 0)
-    focal = (image_size / 2 - 1) / max(np.abs(x / z).max(), np.abs(y / z).max())
-    return Intrinsics(*np.float32([focal, focal, image_size / 2, image_size / 2]))
+    reach = np.abs(_corner_slopes(mesh, np.asarray(T_object_camera.as_matrix()))).max()
+    focal = (image_size / 2 - 1) / reach
+    center = image_size / 2
+    return Intrinsics(*jnp.array([focal, focal, center, center], jnp.float32))
 
 
 def render_depth(
@@ -63,25 +62,45 @@ def render_depth(
     Depth is infinite where the ray meets nothing; the cosine is 1 there. `T_object_camera` holds
     one pose per view. True visibility: among all triangles on a ray the nearest counts.
     """
-    pixels = camera.unproject(intrinsics, np.ones((image_size, image_size), np.float32))
+    pixels = camera.unproject(intrinsics, jnp.ones((image_size, image_size)))
     rays = np.asarray(pixels).reshape(-1, 3)  # z is 1, so the ray parameter is the depth
     poses = np.asarray(T_object_camera.as_matrix())
-    directions = (rays @ poses[:, :3, :3].swapaxes(1, 2)).reshape(-1, 3)
-    origins = np.repeat(poses[:, :3, 3], len(rays), axis=0)
+    view, pixel = np.nonzero(_may_hit(mesh, poses, rays))
+    directions = (rays @ poses[:, :3, :3].swapaxes(1, 2))[view, pixel]
+    origins = poses[view, :3, 3]
 
     triangle = mesh.ray.intersects_first(origins, directions)
-    (hit,) = np.nonzero(triangle >= 0)
-    normal = mesh.face_normals[triangle[hit]]
-    to_plane = mesh.triangles[triangle[hit], 0] - origins[hit]
-    facing = np.sum(normal * directions[hit], axis=1)
+    hit = triangle >= 0
+    view, pixel, triangle, directions = view[hit], pixel[hit], triangle[hit], directions[hit]
+    normal = mesh.face_normals[triangle]
+    facing = np.sum(normal * directions, axis=1)
     facing = np.where(np.abs(facing) > 1e-9, facing, np.nan)  # the ray lies in the plane
+    to_plane = np.sum(normal * (mesh.triangles[triangle, 0] - origins[hit]), axis=1)
 
-    depth = np.full(len(origins), np.inf, np.float32)
-    cosine = np.ones(len(origins), np.float32)
-    depth[hit] = np.nan_to_num(np.sum(normal * to_plane, axis=1) / facing, nan=np.inf)
-    cosine[hit] = np.nan_to_num(np.abs(facing)) / np.linalg.norm(directions[hit], axis=1)
+    depth = np.full((len(poses), len(rays)), np.inf, np.float32)
+    cosine = np.ones_like(depth)
+    depth[view, pixel] = np.nan_to_num(to_plane / facing, nan=np.inf)
+    cosine[view, pixel] = np.nan_to_num(np.abs(facing)) / np.linalg.norm(directions, axis=1)
     shape = (-1, image_size, image_size)
     return depth.reshape(shape), cosine.reshape(shape)
+
+
+def _corner_slopes(
+    mesh: trimesh.Trimesh, poses: Float[np.ndarray, "views 4 4"]
+) -> Float[np.ndarray, "views 8 2"]:
+    """x / z and y / z, in each camera, of the corners of the mesh's bounding box."""
+    offsets = trimesh.bounds.corners(mesh.bounds) - poses[:, None, :3, 3]
+    corners = offsets @ poses[:, :3, :3]  # the inverse of a rotation is its transpose
+    return corners[..., :2] / corners[..., 2:]
+
+
+def _may_hit(
+    mesh: trimesh.Trimesh, poses: Float[np.ndarray, "views 4 4"], rays: Float[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, "views n"]:
+    """Rays inside the rectangle that the mesh's bounding box covers in each image."""
+    slopes = _corner_slopes(mesh, poses)
+    low, high = slopes.min(axis=1)[:, None], slopes.max(axis=1)[:, None]
+    return ((rays[:, :2] >= low) & (rays[:, :2] <= high)).all(axis=-1)
 
 
 def add_sensor_noise(
@@ -91,24 +110,22 @@ def add_sensor_noise(
     noise: SensorNoise = SensorNoise(),
 ) -> Float[np.ndarray, "views h w"]:
     """What a real sensor would have reported; lost pixels become 0, nothing known."""
-    rows, columns = np.indices(depth.shape[1:])
-    jitter = np.rint(rng.normal(0, noise.lateral, (2, *depth.shape))).astype(int)
-    rows = np.clip(rows + jitter[0], 0, depth.shape[1] - 1)
-    columns = np.clip(columns + jitter[1], 0, depth.shape[2] - 1)
-    edge = _is_edge(depth)
-    # Only edges show the jitter across the image; elsewhere it would act as axial noise.
-    views = np.arange(len(depth))[:, None, None]
-    noisy = np.where(edge, depth[views, rows, columns], depth)
+    noisy, (h, w) = depth.copy(), depth.shape[1:]
+    # Only edges show jitter across the image; elsewhere it would act as axial noise.
+    edges = view, row, column = np.nonzero(_is_edge(depth))
+    jitter = np.rint(rng.normal(0, noise.lateral, (2, len(view)))).astype(int)
+    row, column = np.clip(row + jitter[0], 0, h - 1), np.clip(column + jitter[1], 0, w - 1)
+    noisy[edges] = depth[view, row, column]
 
-    seen = np.isfinite(noisy)
-    z = np.where(seen, noisy, 1.0)
-    z = z + rng.normal(0, 1, z.shape) * noise.axial * z**2
-    step = noise.quantization * z**2
-    z = np.rint(z / step) * step
-
-    lost = edge & (rng.random(depth.shape) < noise.dropout)
-    lost |= seen & (cosine < np.cos(np.deg2rad(noise.grazing)))
-    return np.where(lost, 0.0, np.where(seen, z, np.inf)).astype(np.float32)
+    seen = np.nonzero(np.isfinite(noisy))
+    z = noisy[seen].astype(np.float64)
+    z += rng.normal(0, noise.axial, z.shape) * z**2
+    z = 1 / (noise.quantization * np.rint(1 / (noise.quantization * z)))  # steps of disparity
+    grazing = cosine[seen] < np.cos(np.deg2rad(noise.grazing))
+    noisy[seen] = np.where(grazing, 0, z)
+    lost = rng.random(len(view)) < noise.dropout
+    noisy[tuple(index[lost] for index in edges)] = 0
+    return noisy
 
 
 def _is_edge(depth: Float[np.ndarray, "views h w"]) -> np.ndarray:

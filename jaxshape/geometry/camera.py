@@ -93,7 +93,7 @@ def on_sphere(
         ],
         axis=-1,
     )
-    return look_at(radius * direction, jnp.zeros(3))
+    return look_at(radius * direction, jnp.zeros_like(direction))
 
 
 def random_views(key: PRNGKeyArray, count: int, radius: float) -> jaxlie.SE3:

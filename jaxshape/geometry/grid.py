@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 RESOLUTION = 32
 """Voxels along each axis of every grid (paper, section 2.2)."""
 
-MARGIN = 1.0
-"""Voxels left free on each side of the object: room for noise, and for a closed surface."""
+MARGIN = 1.01
+"""Voxels left free on each side of the object: room for noise, and for a closed surface. Not a
+whole number, or rounding would decide into which voxels the faces of the bounding box fall."""
 
 
 class GridFrame(NamedTuple):

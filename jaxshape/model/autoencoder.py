@@ -6,10 +6,13 @@ imported here and nowhere else.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from jaxshape.geometry.grid import RESOLUTION
@@ -38,14 +41,16 @@ class AutoEncoder(nn.Module):
     """Encoder and decoder without skip connections, so that either can be used alone."""
 
     architecture: Architecture = Architecture()
-    dtype: jnp.dtype = jnp.float32
+    dtype: DTypeLike = jnp.float32
     """Of the convolutions' arithmetic; parameters and batch statistics stay float32."""
 
     def setup(self):
         self.encoder = Encoder(self.architecture, self.dtype)
         self.decoder = Decoder(self.architecture, self.dtype)
 
-    def __call__(self, grid: Float[Array, "b x y z"], train: bool) -> Float[Array, "b x y z"]:
+    def __call__(
+        self, grid: Bool[Array, "b x y z"] | Float[Array, "b x y z"], train: bool
+    ) -> Float[Array, "b x y z"]:
         """Logits of the completed grid."""
         return self.decoder(self.encoder(grid, train), train)
 
@@ -60,7 +65,7 @@ class Encoder(nn.Module):
     """32 -> 16 -> 8 -> 4 -> 2 by strided convolutions, then pooling and a 1^3 convolution."""
 
     architecture: Architecture
-    dtype: jnp.dtype
+    dtype: DTypeLike
 
     @nn.compact
     def __call__(self, grid, train):
@@ -76,7 +81,7 @@ class Decoder(nn.Module):
     """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions."""
 
     architecture: Architecture
-    dtype: jnp.dtype
+    dtype: DTypeLike
 
     @nn.compact
     def __call__(self, code, train):
@@ -115,7 +120,8 @@ def _normalize(x, train, name):
 def initialize(key: PRNGKeyArray, architecture: Architecture = Architecture()) -> PyTree:
     """Parameters and batch statistics of an untrained network."""
     grid = jnp.zeros((1, *[RESOLUTION] * 3))
-    return AutoEncoder(architecture).init(key, grid, train=False)
+    # Under jit the forward pass, which Flax traces to find the shapes, is left out.
+    return jax.jit(partial(AutoEncoder(architecture).init, train=False))(key, grid)
 
 
 def architecture_of(params: PyTree) -> Architecture:
@@ -132,7 +138,7 @@ def encode(
     params: PyTree,
     grid: Bool[Array, "*batch x y z"] | Float[Array, "*batch x y z"],
     *,
-    dtype: jnp.dtype = jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> Float[Array, "*batch d"]:
     """The code of a (partial) occupancy grid: the first code of a search (paper, section 3.1)."""
     network = AutoEncoder(architecture_of(params), dtype)
@@ -141,7 +147,7 @@ def encode(
 
 
 def decode(
-    params: PyTree, code: Float[Array, "*batch d"], *, dtype: jnp.dtype = jnp.float32
+    params: PyTree, code: Float[Array, "*batch d"], *, dtype: DTypeLike = jnp.float32
 ) -> Float[Array, "*batch x y z"]:
     """**Logits** of the occupancy that a code stands for; occupied where positive.
 

@@ -13,6 +13,8 @@ voxels `2 i + k - 2`, for taps `k` in 0..4 along each axis.
 
 import itertools
 from collections.abc import Callable
+from functools import reduce
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +97,7 @@ def _downsample_cpu(fine, kernel):
 
     def convolve(fine):
         planes = _gather_taps(fine)
-        return sum(plane @ matrix for plane, matrix in zip(planes, matrices, strict=True))
+        return reduce(jnp.add, map(jnp.matmul, planes, matrices))
 
     return _in_chunks(convolve, _examples_in_cache(fine), fine)
 
@@ -147,7 +149,7 @@ def _gather_then_multiply(kernel) -> Callable[[Array], Array]:
         b, nx, ny, nz, _ = x.shape
         x = jnp.pad(x, [(0, 0), (1, 1), (1, 1), (1, 1), (0, 0)])
         x = jnp.concatenate([x[:, :, :, 1 + d : 1 + d + nz] for d in TAPS], axis=-1)
-        phases = dict.fromkeys(itertools.product(PHASES, repeat=2), 0.0)
+        phases: dict[tuple, Any] = dict.fromkeys(itertools.product(PHASES, repeat=2), 0.0)
         for (dx, dy), matrix in zip(shifts, matrices, strict=True):
             product = x[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny] @ matrix
             for i, phase in enumerate(_taps((dx, dy))):
@@ -175,7 +177,7 @@ def _multiply_then_shift(kernel) -> Callable[[Array], Array]:
         b, nx, ny, nz, _ = x.shape
         x = jnp.pad(x, [(0, 0), (1, 1), (1, 1), (1, 1), (0, 0)])
         product = (x @ matrix).reshape(*x.shape[:-1], len(columns), fine)
-        phases = dict.fromkeys(itertools.product(PHASES, repeat=3), 0.0)
+        phases: dict[tuple, Any] = dict.fromkeys(itertools.product(PHASES, repeat=3), 0.0)
         column = itertools.count()
         for dx, dy, dz in shifts:
             shifted = product[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny, 1 + dz : 1 + dz + nz]
@@ -192,7 +194,9 @@ def _taps(shift: tuple[int, ...]) -> dict[tuple[int, ...], tuple[int, ...]]:
     return {p: tuple(TAPS[d][a] for d, a in zip(shift, p, strict=True)) for p in phases}
 
 
-def _interleave(phases: Array, fine: int) -> Float[Array, "b 2*x 2*y 2*z fine"]:
+def _interleave(
+    phases: Float[Array, "b x y z _ _"], fine: int
+) -> Float[Array, "b 2*x 2*y 2*z {fine}"]:
     """Eight phases per coarse voxel, in the order of their axes, to the fine grid."""
     b, nx, ny, nz = phases.shape[:4]
     phases = phases.reshape(b, nx, ny, nz, 2, 2, 2, fine)

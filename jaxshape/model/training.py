@@ -124,7 +124,7 @@ def batch_of(
     rng = np.random.default_rng((config.seed, 1, step))
     measured, surface = [], []
     for place in places:
-        packed = dataset.packed(orders[place // count][place % count])
+        packed = dataset.packed(int(orders[place // count][place % count]))
         views = rng.integers(1, min(config.max_views, dataset.views) + 1)
         chosen = 1 + rng.choice(dataset.views, views, replace=False)
         measured.append(np.bitwise_or.reduce(packed[chosen], axis=0))

@@ -62,13 +62,13 @@ def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
     return json.loads(_read(_path(path))[1]["card"])
 
 
-def flatten(tree: PyTree) -> dict[str, Array]:
+def flatten(tree: PyTree) -> dict[str, Any]:
     """Name each array of a tree by its path, joined with `/`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): x for path, x in leaves}
 
 
-def unflatten(named: dict[str, Array]) -> PyTree:
+def unflatten(named: dict[str, Any]) -> PyTree:
     """Nested dictionaries from names joined with `/`."""
     tree: dict = {}
     for name, x in named.items():
@@ -81,7 +81,7 @@ def unflatten(named: dict[str, Array]) -> PyTree:
 
 
 def _path(path: str | os.PathLike[str] | None) -> Path:
-    packaged = resources.files("jaxshape") / "chair.safetensors"
+    packaged = resources.files("jaxshape.model") / "chair.safetensors"
     return Path(str(packaged) if path is None else path)
 
 
@@ -120,7 +120,7 @@ def _check(params: PyTree, mean, covariance, path: Path) -> None:
             problem = "the codes' mean or covariance is missing"
         elif mean.shape != (architecture.code,) or covariance.shape != mean.shape * 2:
             problem = f"statistics of {mean.shape} codes for codes of {architecture.code} numbers"
-    except (KeyError, TypeError) as missing:
+    except (KeyError, TypeError, IndexError) as missing:
         problem = f"no array {missing}"
     if problem:
         raise WeightsError(f"{str(path)!r} holds weights of another architecture: {problem}.")

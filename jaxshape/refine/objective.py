@@ -86,8 +86,8 @@ def _loss(params, code, target):
 
 @_loss.def_vmap
 def _over_candidates(size, batched, params, codes, target):
-    del size
     _require_shared(batched[0])
+    codes = codes if batched[1] else jnp.broadcast_to(codes, (size, *codes.shape))
     if any(jax.tree.leaves(batched[2])):  # one candidate for each of several objects
         return _by_chunks(_score, params, codes[:, None], target)[:, 0], True
     return _losses(params, codes, target), True
@@ -118,6 +118,7 @@ def _loss_and_slope(params, code, target):
 @_loss_and_slope.def_vmap
 def _slopes_over_objects(size, batched, params, codes, target):
     _require_shared(batched[0])
+    codes = codes if batched[1] else jnp.broadcast_to(codes, (size, *codes.shape))
     if not any(jax.tree.leaves(batched[2])):
         target = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), target)
     scored = _by_chunks(_score_and_slope, params, codes[:, None], target)

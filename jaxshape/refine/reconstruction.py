@@ -80,14 +80,17 @@ def refiner_for(method: Method, prior: ShapePrior, config: RefineConfig) -> Refi
 
 
 def reconstruct(
-    key: PRNGKeyArray,
+    keys: PRNGKeyArray,
     prior: ShapePrior,
     occupied: Bool[Array, "object x y z"],
     occluded: Bool[Array, "object x y z"],
     refiner: Refiner | None,
     config: RefineConfig,
 ) -> Reconstruction:
-    """Rebuild a batch of objects from their measurement grids F and occlusion masks M."""
+    """Rebuild a batch of objects from their measurement grids F and occlusion masks M.
+
+    `keys` holds one random key per object.
+    """
     first_code = encode(prior.params, occupied)
     first_logits = decode(prior.params, first_code)
     weight = BALANCED_WEIGHT if config.objective == "balanced" else 1.0
@@ -96,7 +99,7 @@ def reconstruct(
     if refiner is None:
         code, logits, objective, trace = first_code, first_logits, first_objective, None
     else:
-        found = refine(key, prior.params, first_code, targets, refiner, config.iterations)
+        found = refine(keys, prior.params, first_code, targets, refiner, config.iterations)
         code, objective, trace = found.code, found.loss, found.trace
         logits = decode(prior.params, code)
     completed = logits > 0
@@ -118,10 +121,9 @@ def reconstruct_jit(refiner: Refiner | None, config: RefineConfig) -> Callable[.
     return jax.jit(partial(reconstruct, refiner=refiner, config=config))
 
 
-def require_measured(occupied: Bool[Array, "*batch x y z"]) -> None:
+def require_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> None:
     """Raise `ValueError` when a grid has no occupied voxel: there is nothing to rebuild from."""
-    counts = np.asarray(jnp.sum(occupied, axis=(-3, -2, -1)))
-    if (counts == 0).any():
+    if not np.asarray(occupied).any(axis=(-3, -2, -1)).all():
         raise ValueError(
             "Nothing was measured inside the object's box: no segmented depth pixel falls into it. "
             "Check the box, the masks, the depth scale and which way the poses go."

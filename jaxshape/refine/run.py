@@ -24,7 +24,7 @@ class Refined(NamedTuple):
 
 
 def refine(
-    key: PRNGKeyArray,
+    keys: PRNGKeyArray,
     params: PyTree,
     codes: Float[Array, "object d"],
     targets: Target,
@@ -33,11 +33,10 @@ def refine(
 ) -> Refined:
     """Search from each object's first code for one that explains its target better (section 3.3).
 
-    All candidates of all objects go through the decoder in one call per iteration. Objects do not
-    influence each other, nor does their number: each draws from a key of its own.
+    All candidates of all objects go through the decoder in one call per iteration. `keys` holds one
+    key per object: objects do not influence each other, and find the same in any company.
     """
     search = partial(_refine_one, params, refiner, iterations)
-    keys = jax.vmap(partial(jax.random.fold_in, key))(jax.numpy.arange(len(codes)))
     return jax.vmap(search)(keys, codes, targets)
 
 

@@ -1,17 +1,20 @@
 """Score refinement methods on meshes seen along an orbit (paper, section 4.1). [host]"""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PRNGKeyArray
 
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.dataset import hash_seed
-from jaxshape.data.meshes import Model
+from jaxshape.data.meshes import Model, Skipped
+from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine.reconstruction import (
@@ -19,7 +22,6 @@ from jaxshape.refine.reconstruction import (
     RefineConfig,
     reconstruct_jit,
     refiner_for,
-    require_measured,
 )
 from jaxshape.results.metrics import bounds, iou, shape_scores
 
@@ -40,6 +42,9 @@ class EvaluateConfig:
     seed: int = 0
 
 
+NOTHING = "No pixel of some number of frames meets the mesh: it is too thin for the camera."
+
+
 class Case(NamedTuple):
     """One object after one number of frames; batched over both."""
 
@@ -48,8 +53,11 @@ class Case(NamedTuple):
     surface: Bool[Array, "*case x y z"]
 
 
-def observe(model: Model, config: EvaluateConfig) -> Case:
-    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k asked for."""
+def observe(model: Model, config: EvaluateConfig) -> Case | None:
+    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k asked for.
+
+    None where some number of frames measured nothing.
+    """
     mesh = model.mesh
     # Independent of the other meshes, so that a mesh scores the same in any company.
     seed = hash_seed(config.seed, *model.name.encode())
@@ -58,15 +66,18 @@ def observe(model: Model, config: EvaluateConfig) -> Case:
     merged = fusion.merge_cumulative(measure_frames(captured))
     chosen = jax.tree.map(lambda x: x[np.array(config.frames) - 1], merged)
     occupied = fusion.occupied(chosen)
-    require_measured(occupied)
+    if not occupied.any(axis=(1, 2, 3)).all():
+        return None
     surface = jnp.broadcast_to(captured.surface, occupied.shape)
     return Case(occupied, fusion.occluded(chosen), surface)
 
 
 def evaluate(
     prior: ShapePrior, models: Sequence[Model], config: EvaluateConfig
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[dict[str, Any] | Skipped]:
     """Yield the scores of each mesh in turn, as they go under `per_mesh` into the results file.
+
+    A mesh of which nothing was measured is yielded as skipped.
 
     Meshes are refined in batches; the last batch is filled up with its own first cases so that
     one compiled program serves all.
@@ -78,22 +89,36 @@ def evaluate(
     group = max(1, OBJECTS_AT_A_TIME // len(config.frames))
     size = min(group, len(models)) * len(config.frames)
     for start in range(0, len(models), group):
-        chosen = models[start : start + group]
-        cases = jax.tree.map(lambda *x: jnp.concatenate(x), *[observe(m, config) for m in chosen])
-        filled = jax.tree.map(lambda x: jnp.resize(x, (size, *x.shape[1:])), cases)
-        key = jax.random.key(config.seed)
+        observed = [(model, observe(model, config)) for model in models[start : start + group]]
+        yield from (Skipped(m.name, "nothing measured", NOTHING) for m, c in observed if c is None)
+        seen = [(model, case) for model, case in observed if case is not None]
+        if not seen:
+            continue
+        keys = jnp.stack([key for model, _ in seen for key in _keys(model, config)])
+        cases = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in seen])
+        keys, filled = jax.tree.map(lambda x: _fill(x, size), (keys, cases))
         found = {
-            method: jax.device_get(run[method](key, prior, filled.occupied, filled.occluded))
+            method: jax.device_get(run[method](keys, prior, filled.occupied, filled.occluded))
             for method in config.methods
         }
         cases = jax.device_get(cases)
-        for i, model in enumerate(chosen):
+        for i, (model, _) in enumerate(seen):
             rows = range(i * len(config.frames), (i + 1) * len(config.frames))
             frames = {
                 str(k): _scores(jax.tree.map(lambda x, row=row: x[row], cases), found, row)
                 for k, row in zip(config.frames, rows, strict=True)
             }
             yield {"name": model.name, "metadata": model.metadata, "frames": frames}
+
+
+def _keys(model: Model, config: EvaluateConfig) -> list[PRNGKeyArray]:
+    """Random keys that depend on the mesh and the number of frames, not on the batch."""
+    return [jax.random.key(hash_seed(config.seed, k, *model.name.encode())) for k in config.frames]
+
+
+def _fill(rows: Array, size: int) -> Array:
+    """Repeat the first rows until there are `size`."""
+    return rows[jnp.arange(size) % len(rows)]
 
 
 def _scores(case: Case, found: dict[str, Any], row: int) -> dict[str, Any]:
@@ -129,3 +154,28 @@ def summarize(per_mesh: Sequence[dict[str, Any]], config: EvaluateConfig) -> dic
 def as_json(config: EvaluateConfig) -> dict[str, Any]:
     """The settings as plain values."""
     return asdict(config)
+
+
+# A long evaluation keeps its scores in a journal beside the results file until that is written.
+
+
+def read_journal(output: Path, settings: str) -> list[dict[str, Any]]:
+    """The scores that an evaluation under these settings had reached when it was killed."""
+    path = _journal(output)
+    content = json.loads(path.read_text()) if path.exists() else {}
+    return content["per_mesh"] if content.get("settings") == settings else []
+
+
+def write_journal(output: Path, settings: str, per_mesh: Sequence[dict[str, Any]]) -> None:
+    """Keep the scores reached so far."""
+    with atomic_path(_journal(output)) as path:
+        path.write_text(json.dumps({"settings": settings, "per_mesh": per_mesh}))
+
+
+def remove_journal(output: Path) -> None:
+    """Forget the scores reached so far, once the results file is written."""
+    _journal(output).unlink(missing_ok=True)
+
+
+def _journal(output: Path) -> Path:
+    return output.with_name(output.name + ".partial")

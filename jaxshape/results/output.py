@@ -25,7 +25,7 @@ SMOOTHING = 20
 class Observation(NamedTuple):
     """What was measured of one object, and where its grid lies."""
 
-    depth: Sequence[Float[np.ndarray, "h w"]]
+    depth: Sequence[Float[np.ndarray, "_ _"]]
     """A few depth frames to show, in metres."""
     occupied: Bool[np.ndarray, "x y z"]
     occluded: Bool[np.ndarray, "x y z"]
@@ -103,7 +103,7 @@ def _draw(path: Path, observation: Observation, one: Any, result: dict[str, Any]
 
     composed = np.where(observation.occluded, 2 * one.composed, observation.occupied.astype(int))
     columns = [
-        measurement_panel("measured F, occluded M", observation.occupied, observation.occluded),
+        measurement_panel("F (blue) and M", observation.occupied, observation.occluded),
         grid_panel("encoder", one.completed_first, "predicted", note=note("iou_encoder")),
         grid_panel("refined", one.completed, "predicted", note=note("iou_refined")),
         grid_panel("composed", composed, "measured", "predicted", note=note("iou_composed")),

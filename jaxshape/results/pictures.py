@@ -255,7 +255,7 @@ def mesh_panel(title: str, mesh: trimesh.Trimesh, color: str, note: str = "") ->
     return Panel(title, render_mesh(mesh, color=COLORS[color], size=_CELL), note)
 
 
-def depth_panels(depth_frames: Sequence[Float[np.ndarray, "h w"]]) -> list[Panel]:
+def depth_panels(depth_frames: Sequence[Float[np.ndarray, "_ _"]]) -> list[Panel]:
     """Picture depth images, near ones dark, with one scale for all.
 
     Depth is in metres; 0 (invalid) is grey, infinity (background) pale.
@@ -280,7 +280,7 @@ _WIDTH, _GAP, _TEXT, _CELL = 1600, 16, 34, 400  # pixels
 def overview(
     path: str | Path,
     *,
-    depth_frames: Sequence[Float[np.ndarray, "h w"]],
+    depth_frames: Sequence[Float[np.ndarray, "_ _"]],
     columns: Sequence[Panel],
     caption: str = "",
 ) -> None:

@@ -61,13 +61,25 @@ def test_a_level_file_gives_a_right_handed_upright_box(tmp_path, handedness):
     np.testing.assert_array_equal(points_in_box(p_world, box), expected)
 
 
-def test_a_rule_in_words_is_not_silently_dropped(tmp_path):
+def test_a_rule_of_the_level_frame_leaves_out_what_it_names(tmp_path):
     content = {
         "world_to_level": np.eye(4).tolist(),
         "chair_box_level": {"X": [0, 1], "Y": [0, 1], "h": [0, 1]},
-        "exclude_level": "X > 0.5",
+        "exclude_level": "X > 0.5 and h < 0.25 (the table)",
     }
-    with pytest.warns(UserWarning, match="exclude_level is a rule in words and is not applied"):
+    box = read_box(box_file(tmp_path, content))
+    points = np.random.default_rng(0).uniform(0, 1, (2000, 3))  # world and level are one here
+    excluded = (points[:, 0] > 0.5) & (points[:, 2] < 0.25)
+    np.testing.assert_array_equal(points_in_box(points, box), ~excluded)
+
+
+def test_a_rule_in_words_is_refused(tmp_path):
+    content = {
+        "world_to_level": np.eye(4).tolist(),
+        "chair_box_level": {"X": [0, 1], "Y": [0, 1], "h": [0, 1]},
+        "exclude_level": "the table top",
+    }
+    with pytest.raises(SequenceError, match="'the table top' cannot be read"):
         read_box(box_file(tmp_path, content))
 
 

@@ -45,9 +45,18 @@ def voxels(mesh: trimesh.Trimesh) -> np.ndarray:
     return grid
 
 
+@pytest.fixture
+def without_shape_checks():
+    """Off where a test makes many chairs: they triple the time, and another test has them on."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
+
+
 @pytest.mark.parametrize("style", STYLES)
 def test_pieces_are_closed_finite_and_face_outward(style):
-    for seed in range(12):
+    for seed in range(5):
         mesh = random_chair(seed, style=style)
         assert np.isfinite(mesh.vertices).all()
         for piece in pieces_of(mesh):
@@ -56,8 +65,8 @@ def test_pieces_are_closed_finite_and_face_outward(style):
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_box_is_centred_and_of_a_real_size(style):
-    for seed in range(40):
+def test_box_is_centred_and_of_a_real_size(style, without_shape_checks):
+    for seed in range(20):
         mesh = random_chair(seed, style=style)
         scale = 0.55 if mesh.metadata["drawn"].get("for") == "child" else 1.0
         assert np.allclose(mesh.bounds.sum(0), 0, atol=1e-9)
@@ -66,7 +75,7 @@ def test_box_is_centred_and_of_a_real_size(style):
 
 
 @pytest.mark.parametrize("style", sorted(set(STYLES) - NO_BACK_OR_A_TRAY))
-def test_the_back_is_behind(style):
+def test_the_back_is_behind(style, without_shape_checks):
     """Above the middle of the box, the surface lies behind its centre."""
     offsets = []
     for seed in range(20):
@@ -77,7 +86,7 @@ def test_the_back_is_behind(style):
 
 
 @pytest.mark.parametrize("style", ["side chair", "armchair", "stool", "bar stool", "office"])
-def test_up_is_y(style):
+def test_up_is_y(style, without_shape_checks):
     """A ray from above meets the seat where `seat height` says, above the floor."""
     for seed in range(10):
         mesh = random_chair(seed, style=style)
@@ -99,15 +108,6 @@ def test_same_seed_same_chair_and_style_is_the_only_difference():
         assert first.metadata["seed"] == seed and first.metadata["style"] in STYLES
 
 
-@pytest.fixture
-def without_shape_checks():
-    """Every function was checked by the other tests; here the checks would triple the time."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
-
-
 def test_ten_thousand_seeds_give_ten_thousand_chairs(without_shape_checks):
     digests, styles = set(), dict.fromkeys(STYLES, 0)
     for seed in range(10_000):
@@ -120,7 +120,7 @@ def test_ten_thousand_seeds_give_ten_thousand_chairs(without_shape_checks):
         assert abs(count - expected) < 5 * np.sqrt(expected) + 1, style
 
 
-def test_neighbouring_seeds_look_different():
+def test_neighbouring_seeds_look_different(without_shape_checks):
     """Not only the digits: coarse voxel grids of one style overlap far from fully."""
     grids = [voxels(random_chair(seed, style="side chair")).ravel() for seed in range(60)]
     grids = np.array(grids, float)
@@ -129,7 +129,7 @@ def test_neighbouring_seeds_look_different():
     assert (iou[np.triu_indices(60, 1)] < 0.9).all()
 
 
-def test_voluminous_seats_fill_more_of_their_box():
+def test_voluminous_seats_fill_more_of_their_box(without_shape_checks):
     """Seen as the share of the box that lies between the lowest and the highest surface."""
 
     def filled(style: str) -> float:

@@ -19,6 +19,15 @@ from jaxshape.refine.refiner import Candidate
 KEY = jax.random.key(0)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def quick_compilation():
+    """Most of the time here is the compiler's; its optimisations are not what is tested."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 def start_at(search, code, sigma0=0.5):
     return start(search, Candidate(code, jnp.asarray(jnp.inf)), sigma0)
 
@@ -37,8 +46,17 @@ def assert_sound(state):
 # --- the algorithm, against two other implementations ---------------------------------------
 
 
-@pytest.mark.parametrize("dim, population", [(10, 17), (10, 64), (100, 17), (100, 256)])
-def test_follows_pycma_step_for_step(dim, population):
+@pytest.mark.parametrize(
+    "dim, population, generations",
+    [
+        (10, 17, 40),
+        (10, 64, 40),
+        (100, 17, 10),
+        pytest.param(100, 17, 60, marks=pytest.mark.slow),
+        pytest.param(100, 256, 50, marks=pytest.mark.slow),
+    ],
+)
+def test_follows_pycma_step_for_step(dim, population, generations):
     scale = np.logspace(0, 3, dim)
     oracle = pycma.CMAEvolutionStrategy(
         np.ones(dim), 0.5, {"popsize": population, "verbose": -9, "seed": 3}
@@ -50,7 +68,7 @@ def test_follows_pycma_step_for_step(dim, population):
         search = derive_settings(dim=dim, population=population)
         state = start_at(search, jnp.ones(dim))
         next_state = jax.jit(functools.partial(tell, search))
-        for _ in range(50):
+        for _ in range(generations):
             codes = oracle.ask()
             losses = [float(np.sum(scale * x**2)) for x in codes]
             oracle.tell(codes, losses)
@@ -191,7 +209,7 @@ def generations_of_given_losses():
     return jax.jit(lambda keys, losses: jax.lax.scan(body, first, (keys, losses)))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(hostile_losses)
 def test_any_losses_leave_a_sound_state(losses):
     losses = np.array(losses, np.float32).reshape(5, 8)
@@ -259,7 +277,7 @@ def test_covariance_stays_positive_definite_in_float32_over_500_generations():
 @pytest.mark.parametrize(
     "objective, dim, population, iterations",
     [
-        (ellipsoid, 10, None, 400),
+        pytest.param(ellipsoid, 10, None, 400, marks=pytest.mark.slow),
         (rosenbrock, 6, None, 400),
         (rastrigin, 5, 200, 120),
     ],
@@ -300,9 +318,9 @@ def test_rows_of_a_batch_are_independent_and_keys_decide():
 
 
 def test_a_batch_gives_what_single_runs_give():
-    refiner = cma(dim=30, sigma0=0.5)
+    refiner = cma(dim=8, sigma0=0.5)
     with jax.enable_x64(True):
-        codes = jnp.linspace(-1, 1, 90).reshape(3, 30)
+        codes = jnp.linspace(-1, 1, 24).reshape(3, 8)
         states, _ = jax.jit(lambda: run_batch(refiner, lambda: ellipsoid, KEY, codes, 10))()
         single = jax.jit(lambda key, code: run(refiner, ellipsoid, key, code, 10)[0])
         for row, key in enumerate(jax.random.split(KEY, 3)):

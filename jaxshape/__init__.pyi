@@ -1,0 +1,68 @@
+from .data.capture import Capture, capture, measure_frames
+from .data.chairs import random_chair
+from .data.meshes import load, read_meshes
+from .data.sequences import open_sequence
+from .geometry.camera import Intrinsics, orbit, random_views
+from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
+from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
+from .model.autoencoder import Architecture, decode, encode, initialize
+from .model.weights import ShapePrior, load_prior, save_prior
+from .refine.cma import cma
+from .refine.gradient import gradient
+from .refine.objective import Target, objective, target
+from .refine.reconstruction import Reconstruction, RefineConfig, compose, reconstruct, refiner_for
+from .refine.refiner import Refiner, Trace
+from .refine.run import refine
+from .refine.strategies import evosax_strategy
+from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
+from .results.surface import surface, write_mesh
+
+__all__ = [
+    "Architecture",
+    "Capture",
+    "GridFrame",
+    "Intrinsics",
+    "Measurement",
+    "Reconstruction",
+    "RefineConfig",
+    "Refiner",
+    "ShapePrior",
+    "Target",
+    "Trace",
+    "bounds",
+    "capture",
+    "chamfer_l1",
+    "cma",
+    "compose",
+    "decode",
+    "encode",
+    "evosax_strategy",
+    "f_score",
+    "fit_box",
+    "fit_box_isotropic",
+    "gradient",
+    "initialize",
+    "iou",
+    "load",
+    "load_prior",
+    "measure",
+    "measure_frames",
+    "merge",
+    "merge_all",
+    "objective",
+    "occluded",
+    "occupied",
+    "open_sequence",
+    "orbit",
+    "random_chair",
+    "random_views",
+    "read_meshes",
+    "reconstruct",
+    "refine",
+    "refiner_for",
+    "save_prior",
+    "shape_scores",
+    "surface",
+    "target",
+    "write_mesh",
+]

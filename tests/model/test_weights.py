@@ -1,0 +1,156 @@
+import json
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from jaxshape.model import weights
+from jaxshape.model.autoencoder import Architecture, initialize
+from jaxshape.model.weights import (
+    FORMAT,
+    ShapePrior,
+    WeightsError,
+    load_card,
+    load_prior,
+    save_prior,
+)
+
+TINY = Architecture((4, 4, 8, 8), (8, 8, 4), 10)
+CARD = {"data": "chairs from seeds 0 to 9", "steps": 3, "iou": 0.5}
+KERNEL = "params/decoder/conv1"
+
+
+def random_prior(seed=0):
+    """Weights of any value; only their names and shapes are those of a network."""
+    rng = np.random.default_rng(seed)
+    template = jax.eval_shape(lambda: initialize(jax.random.key(0), TINY))
+    params = jax.tree.map(lambda x: jnp.float32(rng.normal(0, 0.02, x.shape)), template)
+    root = rng.normal(size=(10, 10))
+    return ShapePrior(params, jnp.float32(rng.normal(size=10)), jnp.float32(root @ root.T))
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return random_prior()
+
+
+@pytest.fixture(scope="module")
+def saved(prior, tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "prior.safetensors"
+    save_prior(path, prior, CARD)
+    return path
+
+
+@pytest.fixture
+def rewritten(saved, tmp_path):
+    """Write the file anew with other tensors or another format."""
+
+    def rewrite(change, format=FORMAT):
+        tensors = load_file(saved)
+        change(tensors)
+        path = tmp_path / "changed.safetensors"
+        save_file(tensors, path, {"format": format, "card": json.dumps(CARD)})
+        return path
+
+    return rewrite
+
+
+def test_a_prior_comes_back_in_half_precision(prior, saved):
+    loaded = load_prior(saved)
+    assert jax.tree.structure(loaded) == jax.tree.structure(prior)
+    for found, expected in zip(
+        jax.tree.leaves(loaded.params), jax.tree.leaves(prior.params), strict=True
+    ):
+        assert found.dtype == jnp.float32
+        np.testing.assert_array_equal(found, np.float32(np.float16(expected)))
+    np.testing.assert_array_equal(loaded.code_mean, prior.code_mean)
+    np.testing.assert_array_equal(loaded.code_covariance, prior.code_covariance)
+
+
+def test_the_card_comes_back(saved):
+    assert load_card(saved) == CARD
+
+
+def test_names_of_arrays_and_nested_dictionaries_are_inverse(prior):
+    assert KERNEL in weights.flatten(prior.params)
+    again = weights.unflatten(weights.flatten(prior.params))
+    assert jax.tree.structure(again) == jax.tree.structure(prior.params)
+    jax.tree.map(np.testing.assert_array_equal, again, prior.params)
+
+
+@pytest.mark.parametrize("load", [load_prior, load_card])
+def test_a_missing_file_is_named(load, tmp_path):
+    with pytest.raises(
+        WeightsError, match=r"no weights file .*nowhere\.safetensors.*jaxshape train"
+    ):
+        load(tmp_path / "nowhere.safetensors")
+
+
+@pytest.mark.parametrize("kept", [0, 7, 200, -1])
+def test_a_truncated_file_is_named(kept, saved, tmp_path):
+    path = tmp_path / "half.safetensors"
+    path.write_bytes(saved.read_bytes()[:kept])
+    with pytest.raises(
+        WeightsError, match=r"half\.safetensors.* is not a readable safetensors file"
+    ):
+        load_prior(path)
+
+
+@pytest.mark.parametrize("load", [load_prior, load_card])
+def test_a_foreign_file_is_named_with_its_format(load, rewritten, tmp_path):
+    with pytest.raises(WeightsError, match=f"format 'other-2', not '{FORMAT}'"):
+        load(rewritten(lambda tensors: None, format="other-2"))
+    save_file({"x": np.zeros(3)}, tmp_path / "bare.safetensors")
+    with pytest.raises(WeightsError, match=r"bare\.safetensors.* is of format None"):
+        load(tmp_path / "bare.safetensors")
+
+
+@pytest.mark.parametrize(
+    "name, shape, sentence",
+    [
+        (KERNEL, (5, 5, 5, 8, 7), rf"{KERNEL} is \(5, 5, 5, 8, 7\), expected \(5, 5, 5, 8, 8\)"),
+        ("params/encoder/conv0", (3, 3, 3, 1, 4), r"encoder/conv0 is \(3, 3, 3, 1, 4\), expected"),
+        ("params/decoder/conv0", (), "another architecture"),
+        ("params/stranger", (2,), r"params/stranger is \(2,\), expected no such array"),
+        ("code_mean", (9,), r"statistics of \(9,\) codes for codes of 10 numbers"),
+        ("code_covariance", (10,), "statistics of"),
+    ],
+)
+def test_an_array_of_another_shape_is_named(name, shape, sentence, rewritten):
+    path = rewritten(lambda tensors: tensors.update({name: np.zeros(shape, np.float32)}))
+    with pytest.raises(WeightsError, match=sentence):
+        load_prior(path)
+
+
+@pytest.mark.parametrize(
+    "name, sentence",
+    [
+        ("params/encoder/norm0/scale", "params/encoder/norm0/scale is missing"),
+        ("params/encoder/conv2", "no array 'conv2'"),
+        ("code_mean", "mean or covariance is missing"),
+        ("code_covariance", "mean or covariance is missing"),
+    ],
+)
+def test_a_missing_array_is_named(name, sentence, rewritten):
+    path = rewritten(lambda tensors: tensors.pop(name))
+    with pytest.raises(WeightsError, match=rf"changed\.safetensors.*{sentence}"):
+        load_prior(path)
+
+
+def test_a_kill_during_saving_leaves_the_former_file(prior, tmp_path, monkeypatch):
+    path = tmp_path / "prior.safetensors"
+    save_prior(path, prior, CARD)
+
+    def killed_halfway(tensors, temporary, metadata):
+        temporary.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(weights, "save_file", killed_halfway)
+    with pytest.raises(KeyboardInterrupt):
+        save_prior(path, random_prior(seed=1), {})
+    assert os.listdir(tmp_path) == ["prior.safetensors"]
+    assert load_card(path) == CARD
+    np.testing.assert_array_equal(load_prior(path).code_mean, prior.code_mean)

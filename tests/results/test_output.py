@@ -1,0 +1,129 @@
+"""The files of one reconstruction."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from jaxshape.geometry.grid import GridFrame
+from jaxshape.refine.reconstruction import Reconstruction, compose
+from jaxshape.results import output
+from jaxshape.results.metrics import iou
+from jaxshape.results.output import Observation, write_result
+
+T_WORLD_OBJECT = np.array([[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]], float)
+
+
+def solid(lower, upper):
+    grid = np.zeros((32, 32, 32), bool)
+    grid[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))] = True
+    return grid
+
+
+OCCUPIED, OCCLUDED = solid((4, 4, 4), (8, 28, 28)), solid((8, 4, 4), (28, 28, 28))
+COMPLETED, FIRST = solid((4, 4, 4), (20, 28, 28)), solid((4, 4, 4), (12, 28, 28))
+TRUTH = solid((4, 4, 4), (24, 28, 28))
+OBSERVATION = Observation(
+    depth=[np.full((20, 30), 1.5, np.float32)],
+    occupied=OCCUPIED,
+    occluded=OCCLUDED,
+    frame=GridFrame(jnp.array([-0.32, -0.64, -0.32]), jnp.array([0.02, 0.04, 0.02])),
+    T_world_object=T_WORLD_OBJECT,
+    truth=TRUTH,
+)
+RECONSTRUCTION = Reconstruction(
+    first_code=jnp.zeros((1, 10)),
+    code=jnp.arange(10.0)[None],
+    completed_first=jnp.asarray(FIRST)[None],
+    logits=jnp.where(COMPLETED, 1.0, -1.0)[None],
+    completed=jnp.asarray(COMPLETED)[None],
+    composed=compose(jnp.asarray(OCCUPIED), jnp.asarray(OCCLUDED), jnp.asarray(COMPLETED))[None],
+    first_objective=jnp.array([0.5]),
+    objective=jnp.array([0.25]),
+    trace=None,
+)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("out") / "made" / "on demand"
+    return folder, write_result(folder, OBSERVATION, RECONSTRUCTION, {"seed": 4, "frames": 1})
+
+
+def test_the_files_are_there_and_nothing_else(written):
+    names = {path.name for path in written[0].iterdir()}
+    assert names == {"mesh.glb", "grid.npz", "overview.png", "result.json"}
+
+
+def test_the_result_holds_the_figures_and_the_scores(written):
+    folder, result = written
+    assert json.loads((folder / "result.json").read_text()) == result
+    assert result["seed"] == 4 and result["frames"] == 1
+    assert (result["objective_encoder"], result["objective_refined"]) == (0.5, 0.25)
+    assert (result["voxels_measured"], result["voxels_occluded"]) == (4 * 24**2, 20 * 24**2)
+    assert result["iou_encoder"] == pytest.approx(8 / 20)
+    assert result["iou_refined"] == pytest.approx(float(iou(COMPLETED, TRUTH))) == 16 / 20
+    assert result["iou_composed"] == pytest.approx(16 / 20)
+
+
+def test_the_grids_load_without_pickle_and_agree(written):
+    with np.load(written[0] / "grid.npz", allow_pickle=False) as grids:
+        np.testing.assert_array_equal(grids["occupied"], OCCUPIED)
+        np.testing.assert_array_equal(grids["occluded"], OCCLUDED)
+        np.testing.assert_array_equal(grids["encoder"], FIRST)
+        np.testing.assert_array_equal(grids["refined"], grids["logits"] > 0)
+        expected = np.where(OCCLUDED, grids["refined"], grids["occupied"])
+        np.testing.assert_array_equal(grids["composed"], expected)
+        np.testing.assert_array_equal(grids["truth"], TRUTH)
+        np.testing.assert_array_equal(grids["code"], np.arange(10.0))
+        np.testing.assert_array_equal(grids["T_world_object"], T_WORLD_OBJECT)
+        np.testing.assert_array_equal(grids["voxel_size"], OBSERVATION.frame.voxel_size)
+        np.testing.assert_array_equal(grids["origin"], OBSERVATION.frame.origin)
+
+
+def test_the_mesh_is_closed_and_lies_in_the_world(written):
+    mesh = trimesh.load_mesh(written[0] / "mesh.glb")
+    assert mesh.is_watertight and mesh.volume > 0
+    # Voxels 4 to 20, 28 and 28, in metres, carried to the world.
+    corners = np.array([[4, 4, 4], [20, 28, 28]]) * [0.02, 0.04, 0.02] - [0.32, 0.64, 0.32]
+    world = corners @ T_WORLD_OBJECT[:3, :3].T + T_WORLD_OBJECT[:3, 3]
+    np.testing.assert_allclose(mesh.bounds, np.sort(world, axis=0), atol=0.03)
+    np.testing.assert_allclose(mesh.volume, 16 * 24 * 24 * 0.02 * 0.04 * 0.02, rtol=0.1)
+
+
+def test_the_picture_is_one(written):
+    with Image.open(written[0] / "overview.png") as picture:
+        assert min(picture.size) > 100 and np.ptp(np.asarray(picture)) > 100
+
+
+def test_without_the_truth_no_iou_is_claimed(tmp_path, monkeypatch):
+    monkeypatch.setattr(output, "overview", lambda *args, **settings: None)
+    result = write_result(tmp_path, OBSERVATION._replace(truth=None), RECONSTRUCTION, {})
+    assert not any(name.startswith("iou") for name in result)
+    with np.load(tmp_path / "grid.npz") as grids:
+        assert "truth" not in grids
+
+
+def test_a_failure_leaves_the_earlier_result_and_no_debris(tmp_path, monkeypatch):
+    (tmp_path / "result.json").write_text("earlier")
+    (tmp_path / "overview.png").write_bytes(b"earlier")
+
+    def fail(*args, **settings):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(output, "overview", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_result(tmp_path, OBSERVATION, RECONSTRUCTION, {})
+    assert (tmp_path / "result.json").read_text() == "earlier"
+    assert (tmp_path / "overview.png").read_bytes() == b"earlier"
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_an_empty_shape_is_refused_before_anything_is_written(tmp_path):
+    empty = RECONSTRUCTION._replace(composed=jnp.zeros((1, 32, 32, 32), bool))
+    with pytest.raises(ValueError, match="no surface"):
+        write_result(tmp_path / "new", OBSERVATION, empty, {})
+    assert not (tmp_path / "new").exists()

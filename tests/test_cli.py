@@ -1,0 +1,303 @@
+"""The command line: what is refused, in one sentence and with nothing touched, and what works."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scene import write_scene
+
+from jaxshape import cli
+from jaxshape.data.chairs import random_chair
+from jaxshape.model import weights
+from jaxshape.model.weights import save_prior
+
+COMMANDS = ("demo", "dataset", "train", "reconstruct", "evaluate")
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run a command in this process; returns its exit status, its answer and its complaint."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["jaxshape", *map(str, arguments)])
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as stop:
+            status = stop.code or 0
+        out, err = capsys.readouterr()
+        return status, out, " ".join(err.split())
+
+    return run
+
+
+# --- help -------------------------------------------------------------------------------------
+
+
+def test_help_answers_with_an_example_and_without_jax():
+    program = f"""
+import sys
+from jaxshape import cli
+for command in {COMMANDS}:
+    sys.argv = ["jaxshape", command, "--help"]
+    try:
+        cli.main()
+    except SystemExit as stop:
+        assert not stop.code, command
+    print("end of", command)
+assert "jax" not in sys.modules, "jax was imported"
+"""
+    environment = os.environ | {"COLUMNS": "200", "NO_COLOR": "1"}
+    answer = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment
+    )
+    assert answer.returncode == 0, answer.stderr
+    for command in COMMANDS:
+        text = answer.stdout.split(f"end of {command}")[0].rsplit("end of", 1)[-1]
+        assert re.search(rf"Examples?:\s.*jaxshape {command}", text, re.DOTALL), command
+
+
+# --- bad input --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "frames"
+    write_scene(folder, random_chair(2, style="side chair"), frames=2)
+    return folder
+
+
+@pytest.fixture
+def frames(scene, tmp_path):
+    """A copy to break."""
+    copy = tmp_path / "frames"
+    copy.mkdir()
+    for path in scene.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    return copy
+
+
+@pytest.fixture
+def refused(run, tmp_path):
+    """Run a command that must fail with status 2, and leave earlier output as it was."""
+
+    def refused(command, *arguments, output=None):
+        output = output or tmp_path / "out"
+        output.mkdir(parents=True, exist_ok=True)
+        kept = output / "result.json"
+        kept.write_text("earlier")
+        target = kept if command == "evaluate" else output
+        status, out, err = run(command, *arguments, "--output", target)
+        assert status == 2 and not out, (status, out, err)
+        assert kept.read_text() == "earlier"
+        assert list(output.iterdir()) == [kept]
+        assert "Traceback" not in err and err.count("jaxshape:") == 1
+        complaint = err.split("jaxshape:", 1)[1].strip()
+        assert complaint.endswith(".") or complaint.endswith("?"), complaint
+        return complaint
+
+    return refused
+
+
+def rewrite_box(folder, **changed):
+    box = json.loads((folder / "box.json").read_text())
+    (folder / "box.json").write_text(json.dumps(box | changed))
+
+
+def truncate(folder):
+    path = folder / "frame-000001.depth.png"
+    path.write_bytes(path.read_bytes()[:60])
+
+
+def shear(folder):
+    np.savetxt(folder / "frame-000001.pose.txt", np.diag([2.0, 1, 1, 1]))
+
+
+def in_metres(folder):
+    for path in folder.glob("*.depth.png"):
+        Image.fromarray((np.array(Image.open(path)) // 1000).astype(np.uint16)).save(path)
+
+
+def move_the_box(folder):
+    T = np.eye(4)
+    T[:3, 3] = 100
+    rewrite_box(folder, T_world_object=T.tolist())
+
+
+@pytest.mark.parametrize(
+    "damage, said",
+    [
+        (truncate, "cannot be read as an image"),
+        (shear, "expected a rigid motion"),
+        (in_metres, "--depth-scale"),
+        (move_the_box, "Nothing was measured inside the object's box"),
+        (lambda folder: (folder / "box.json").write_text("{"), "cannot be read as JSON"),
+        (lambda folder: rewrite_box(folder, size=[1, -1, 1]), "expected positive extents"),
+        (lambda folder: (folder / "camera-intrinsics.txt").unlink(), "is missing"),
+    ],
+)
+def test_a_damaged_scan_is_refused(frames, refused, damage, said):
+    damage(frames)
+    assert said in refused("reconstruct", frames, "--box", frames / "box.json")
+
+
+def test_a_missing_folder_or_box_is_refused(frames, refused, tmp_path):
+    assert "is not a folder" in refused("reconstruct", tmp_path / "nowhere")
+    assert "give its box with --box" in refused("reconstruct", frames)
+    assert "cannot be read" in refused("reconstruct", frames, "--box", tmp_path / "nowhere.json")
+
+
+@pytest.fixture(scope="module")
+def chair(tmp_path_factory):
+    path = tmp_path_factory.mktemp("meshes") / "chair.ply"
+    random_chair(3, style="side chair").export(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (("--every", "0"), "--every is 0"),
+        (("--min-hits", "0"), "--min-hits is 0"),
+        (("--iterations", "0"), "--iterations is 0"),
+        (("--population", "2"), "--population is 2"),
+        (("--depth-scale", "0"), "The depth scale is 0"),
+    ],
+)
+def test_options_of_a_scan_out_of_range_are_refused(scene, refused, tmp_path, options, said, prior):
+    save_prior(tmp_path / "tiny.safetensors", prior, {})
+    some = ("--box", scene / "box.json", "--weights", tmp_path / "tiny.safetensors")
+    assert said in refused("reconstruct", scene, *some, *options)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (("--frames", "1,x"), "--frames is '1,x'"),
+        (("--frames", "0"), "--frames is '0'"),
+        (("--frames", "2,2"), "--frames is '2,2'"),
+        (("--methods", "encoder,magic"), "--methods names 'magic'"),
+        (("--up", "q"), "up must be one of"),
+        (("--up", "z"), "must be perpendicular"),
+    ],
+)
+def test_options_of_an_evaluation_out_of_range_are_refused(
+    chair, refused, tmp_path, options, said, prior
+):
+    save_prior(tmp_path / "tiny.safetensors", prior, {})
+    some = ("--meshes", chair, "--weights", tmp_path / "tiny.safetensors")
+    assert said in refused("evaluate", *some, *options)
+
+
+def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior):
+    save_prior(tmp_path / "tiny.safetensors", prior, {})
+    tiny = ("--weights", tmp_path / "tiny.safetensors")
+    (tmp_path / "empty.ply").write_bytes(b"")
+    said = refused("evaluate", "--meshes", tmp_path / "empty.ply", *tiny)
+    assert "None of the 1 meshes can be used" in said and "empty" in said
+    refused("evaluate", "--meshes", tmp_path / "nowhere.ply", *tiny)
+
+    lying = trimesh.load_mesh(chair)
+    lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    lying.export(tmp_path / "lying.ply")
+    said = refused("evaluate", "--meshes", tmp_path / "lying.ply", *tiny)
+    assert "lie on their side" in said and "--up z" in said
+
+
+def test_other_weights_are_refused(chair, refused, tmp_path, prior):
+    said = refused("evaluate", "--meshes", chair, "--weights", tmp_path / "nowhere.safetensors")
+    assert "There is no weights file" in said
+    (tmp_path / "noise.safetensors").write_bytes(b"not weights")
+    said = refused("evaluate", "--meshes", chair, "--weights", tmp_path / "noise.safetensors")
+    assert "is not a readable safetensors file" in said
+    swapped = jax.tree.map(lambda x: x, prior.params)
+    swapped["params"]["decoder"]["conv1"] = swapped["params"]["decoder"]["conv1"][..., :3]
+    save_prior(tmp_path / "other.safetensors", prior._replace(params=swapped), {})
+    said = refused("evaluate", "--meshes", chair, "--weights", tmp_path / "other.safetensors")
+    assert "weights of another architecture" in said
+
+
+def test_a_missing_dataset_is_refused(refused, tmp_path):
+    assert "There is no dataset" in refused("train", "--dataset", tmp_path / "nowhere")
+    assert "--chairs is 0" in refused("dataset", "--chairs", 0)
+    assert "--views is 0" in refused("dataset", "--views", 0)
+
+
+# --- what works -------------------------------------------------------------------------------
+
+RESULTS = {"mesh.glb", "grid.npz", "overview.png", "result.json"}
+
+
+@pytest.fixture
+def linear_weights(linear_prior, monkeypatch):
+    """A prior that compiles at once, in place of the packaged weights."""
+    monkeypatch.setattr(weights, "load_prior", lambda path=None: linear_prior)
+
+
+def test_reconstruct_writes_its_files(run, scene, tmp_path, linear_weights):
+    arguments = (scene, "--box", scene / "box.json", "--iterations", 2, "--output", tmp_path)
+    status, out, err = run("reconstruct", *arguments)
+    assert status == 0, err
+    assert {path.name for path in tmp_path.iterdir()} == RESULTS
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["frames"] == 2 and result["iterations"] == 2 and result["seconds"] > 0
+    assert result["objective_refined"] <= result["objective_encoder"]
+    assert "objective:" in out and str(tmp_path) in out
+
+
+def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear_weights):
+    results = []
+    for name in ("first", "second"):
+        arguments = ("--frames", 2, "--method", "gradient", "--iterations", 2)
+        status, out, err = run("demo", *arguments, "--output", tmp_path / name)
+        assert status == 0 and "IoU with the true surface" in out, err
+        assert {path.name for path in (tmp_path / name).iterdir()} == RESULTS
+        results.append(json.loads((tmp_path / name / "result.json").read_text()))
+    for score in ("iou_encoder", "iou_refined", "iou_composed"):
+        assert 0 <= results[0][score] <= 1
+    assert results[0].pop("seconds") > 0 and results[1].pop("seconds") > 0
+    assert results[0] == results[1]
+
+
+def test_evaluate_writes_scores_of_each_mesh_and_their_means(run, chair, tmp_path, linear_weights):
+    path = tmp_path / "scores.json"
+    arguments = ("--frames", "1,2", "--methods", "encoder,gradient", "--iterations", 2)
+    status, out, err = run("evaluate", "--meshes", chair, *arguments, "--output", path)
+    assert status == 0, err
+    content = json.loads(path.read_text())
+    assert set(content) == {"config", "skipped", "per_mesh", "means"}
+    assert content["config"]["frames"] == [1, 2] and content["config"]["seconds"] > 0
+    assert set(content["means"]) == {"1", "2"}
+    assert set(content["means"]["1"]) == {"encoder", "gradient", "bounds"}
+    assert content["per_mesh"][0]["frames"] == content["means"]
+    assert "encoder" in out and "gradient" in out
+
+
+@pytest.mark.slow
+def test_from_dataset_to_training_to_reconstruction(run, chair, tmp_path):
+    data, trained = tmp_path / "data", tmp_path / "train"
+    make = ("dataset", "--chairs", 4, "--views", 2, "--workers", 1, "--output", data)
+    learn = ("train", "--dataset", data, "--output", trained, "--steps", 2, "--batch", 2)
+    sizes = ("--encoder", 4, 4, 8, 8, "--decoder", 8, 8, 4, "--code", 10)
+    few = ("--weights", trained / "weights.safetensors", "--iterations", 2)
+    for command in (
+        make,
+        (*learn, *sizes),
+        ("evaluate", "--meshes", chair, "--frames", "1", "--output", tmp_path / "s.json", *few),
+    ):
+        status, _, err = run(*command)
+        assert status == 0, err
+    assert json.loads((trained / "card.json").read_text())["samples"] == 4
+    assert set(json.loads((tmp_path / "s.json").read_text())["means"]) == {"1"}
+    # An untrained decoder may call every voxel free, which leaves no surface to write.
+    status, out, err = run("demo", "--frames", 2, "--output", tmp_path / "demo", *few)
+    assert status == 0, err
+    result = json.loads((tmp_path / "demo" / "result.json").read_text())
+    assert {"iou_encoder", "iou_refined", "iou_composed", "seconds"} <= set(result)
