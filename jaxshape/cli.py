@@ -36,7 +36,7 @@ class Search:
     """Steps of the search."""
     population: int = 17
     """Candidates per CMA-ES step."""
-    sigma0: float = 0.5
+    sigma0: float = 0.1
     """First step size of CMA-ES, in standard deviations of the training codes."""
     step_size: float = 0.14
     """Step size of gradient descent."""

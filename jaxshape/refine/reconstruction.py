@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key
 
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior
@@ -32,7 +32,7 @@ class RefineConfig:
     """Steps of the search (paper: 350)."""
     population: int = 17
     """Candidates per CMA-ES iteration (pycma's default for 100 dimensions)."""
-    sigma0: float = 0.5
+    sigma0: float = 0.1
     """First step size of CMA-ES, in standard deviations of the training codes."""
     step_size: float = 0.14
     """Of gradient descent, on the codes themselves (paper: 0.14)."""
@@ -80,7 +80,7 @@ def refiner_for(method: Method, prior: ShapePrior, config: RefineConfig) -> Refi
 
 
 def reconstruct(
-    keys: PRNGKeyArray,
+    keys: Key[Array, " object"],
     prior: ShapePrior,
     occupied: Bool[Array, "object x y z"],
     occluded: Bool[Array, "object x y z"],

@@ -4,7 +4,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from jaxshape.refine.objective import Target, objective
 from jaxshape.refine.refiner import Refiner, Trace, keep_better
@@ -24,7 +24,7 @@ class Refined(NamedTuple):
 
 
 def refine(
-    keys: PRNGKeyArray,
+    keys: Key[Array, " object"],
     params: PyTree,
     codes: Float[Array, "object d"],
     targets: Target,

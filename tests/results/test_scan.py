@@ -11,6 +11,7 @@ from jaxshape.data.boxes import read_box
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.sequences import SequenceError, open_sequence
 from jaxshape.geometry import fusion, grid
+from jaxshape.geometry.grid import MARGIN, RESOLUTION
 from jaxshape.results.metrics import iou
 from jaxshape.results.scan import observe_sequence
 
@@ -118,6 +119,8 @@ def test_more_hits_are_asked_of_a_voxel(recorded, observed):
 def test_isotropic_voxels_are_cubes_around_the_same_centre(recorded, observed):
     _, sequence, box = recorded
     found = observe_sequence(sequence, range(FRAMES), box, isotropic=True)
-    np.testing.assert_allclose(found.frame.voxel_size, box.size.max() / 30, rtol=1e-5)
+    np.testing.assert_allclose(
+        found.frame.voxel_size, box.size.max() / (RESOLUTION - 2 * MARGIN), rtol=1e-5
+    )
     np.testing.assert_allclose(found.frame.origin + 16 * found.frame.voxel_size, 0, atol=1e-5)
     assert np.ptp(np.asarray(observed.frame.voxel_size)) > 1e-3
