@@ -8,9 +8,10 @@ from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
 from .model.autoencoder import Architecture, decode, encode, initialize
 from .model.weights import ShapePrior, load_prior, save_prior
 from .refine.cma import cma
+from .refine.config import RefineConfig
 from .refine.gradient import gradient
 from .refine.objective import Target, objective, target
-from .refine.reconstruction import Reconstruction, RefineConfig, compose, reconstruct, refiner_for
+from .refine.reconstruction import Reconstruction, compose, reconstruct, refiner_for
 from .refine.refiner import Refiner, Trace
 from .refine.run import refine
 from .refine.strategies import evosax_strategy

@@ -11,9 +11,9 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -22,41 +22,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from tyro.conf import Positional, subcommand
 
+from jaxshape.refine.config import METHODS, Method, RefineConfig
+
 console = Console(stderr=True)
 """Progress, warnings and errors; what a command answers goes to standard output."""
-
-
-@dataclass(frozen=True)
-class Search:
-    """How a shape is searched for."""
-
-    objective: Literal["balanced", "paper"] = "balanced"
-    """Residual: `paper` is Eq. 7 as printed; `balanced` weighs measured occupied voxels up."""
-    iterations: int = 350
-    """Steps of the search."""
-    population: int = 17
-    """Candidates per CMA-ES step."""
-    sigma0: float = 0.1
-    """First step size of CMA-ES, in standard deviations of the training codes."""
-    step_size: float = 0.14
-    """Step size of gradient descent."""
-
-    def config(self):
-        """The settings as the library takes them."""
-        from jaxshape.refine.reconstruction import RefineConfig
-
-        _require(self.iterations >= 1, f"--iterations is {self.iterations}; give 1 or more.")
-        _require(self.population >= 3, f"--population is {self.population}; give 3 or more.")
-        return RefineConfig(**vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rebuild:
     """What the commands that rebuild one object have in common."""
 
-    method: Literal["encoder", "gradient", "cma"] = "cma"
+    method: Method = "cma"
     """How the first code is searched on: not at all, by gradient descent, by CMA-ES."""
-    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
+    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
     seed: int = 0
@@ -74,7 +52,7 @@ class Rebuild:
         from jaxshape.results.output import write_result
 
         require_measured(observation.occupied)
-        prior, config = load_prior(self.weights), self.search.config()
+        prior, config = load_prior(self.weights), _checked(self.search)
         with console.status("searching the space of shapes"):
             grids = jnp.asarray(observation.occupied)[None], jnp.asarray(observation.occluded)[None]
             run = reconstruct_jit(refiner_for(self.method, prior, config), config)
@@ -311,7 +289,7 @@ class Evaluate:
     """Add the faults of a real depth sensor."""
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
-    search: tyro.conf.OmitArgPrefixes[Search] = field(default_factory=Search)
+    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
     seed: int = 0
     """Of noise, surface samples and searches."""
 
@@ -322,7 +300,6 @@ class Evaluate:
         from jaxshape.data.meshes import Skipped, axes_to_canonical
         from jaxshape.files import atomic_path
         from jaxshape.model.weights import load_prior
-        from jaxshape.refine.reconstruction import METHODS
         from jaxshape.results import evaluation
 
         frames = _numbers(self.frames, "--frames")
@@ -341,7 +318,7 @@ class Evaluate:
         sources = list_meshes(self.meshes) if self.meshes else test_seeds
         prior = load_prior(self.weights)
         config = evaluation.EvaluateConfig(
-            frames, methods, self.noise, self.search.config(), self.seed
+            frames, methods, self.noise, _checked(self.search), self.seed
         )
         models, skipped = _load_models(sources, self.up, self.front)
         settings = json.dumps([evaluation.as_json(config), vars(self)], default=str, sort_keys=True)
@@ -405,6 +382,12 @@ def _load_models(sources, up: str, front: str):
         "name the axis that points up, for example --up z --front -y.",
     )
     return models, skipped
+
+
+def _checked(search: RefineConfig) -> RefineConfig:
+    _require(search.iterations >= 1, f"--iterations is {search.iterations}; give 1 or more.")
+    _require(search.population >= 3, f"--population is {search.population}; give 3 or more.")
+    return search
 
 
 def _report_skipped(skipped) -> None:

@@ -1,9 +1,8 @@
 """From measurements to shapes: first code, search, completed and composed grids (paper, Fig. 4)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,29 +12,11 @@ from jaxtyping import Array, Bool, Float, Key
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine.cma import cma
+from jaxshape.refine.config import Method, RefineConfig
 from jaxshape.refine.gradient import gradient
 from jaxshape.refine.objective import BALANCED_WEIGHT, cross_entropy, target
 from jaxshape.refine.refiner import Refiner, Trace
 from jaxshape.refine.run import refine
-
-Method = Literal["encoder", "gradient", "cma"]
-METHODS: tuple[Method, ...] = ("encoder", "gradient", "cma")
-
-
-@dataclass(frozen=True)
-class RefineConfig:
-    """How a shape is searched for."""
-
-    objective: Literal["balanced", "paper"] = "balanced"
-    """`paper` is Eq. 7 as printed; `balanced` weighs measured occupied voxels three times."""
-    iterations: int = 350
-    """Steps of the search (paper: 350)."""
-    population: int = 17
-    """Candidates per CMA-ES iteration (pycma's default for 100 dimensions)."""
-    sigma0: float = 0.1
-    """First step size of CMA-ES, in standard deviations of the training codes."""
-    step_size: float = 0.14
-    """Of gradient descent, on the codes themselves (paper: 0.14)."""
 
 
 class Reconstruction(NamedTuple):

@@ -13,7 +13,8 @@ from jaxshape.data.dataset import TEST_SEEDS
 from jaxshape.geometry import camera, fusion
 from jaxshape.model.autoencoder import Architecture, architecture_of, decode, encode
 from jaxshape.model.weights import load_card, load_prior
-from jaxshape.refine.reconstruction import RefineConfig, reconstruct, refiner_for
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.reconstruction import reconstruct, refiner_for
 from jaxshape.results.metrics import iou
 
 FRAMES = 6

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
 from jaxshape.refine import reconstruction
+from jaxshape.refine.config import METHODS, RefineConfig
 from jaxshape.refine.objective import cross_entropy, target
 from jaxshape.refine.reconstruction import (
-    METHODS,
-    RefineConfig,
     compose,
     reconstruct_jit,
     refiner_for,

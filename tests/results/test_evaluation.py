@@ -10,7 +10,7 @@ import trimesh
 
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.meshes import Model
-from jaxshape.refine.reconstruction import RefineConfig
+from jaxshape.refine.config import RefineConfig
 from jaxshape.results import evaluation
 from jaxshape.results.evaluation import (
     EvaluateConfig,
