@@ -11,7 +11,7 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -322,7 +322,7 @@ class Evaluate:
             frames, methods, self.noise, _checked(self.search), self.seed
         )
         models, skipped = _load_models(sources, self.up, self.front)
-        settings = json.dumps([evaluation.as_json(config), vars(self)], default=str, sort_keys=True)
+        settings = json.dumps(vars(self), default=str, sort_keys=True)
         per_mesh = evaluation.read_journal(self.output, settings)
         scored = {scores["name"] for scores in per_mesh}
         left = [model for model in models if model.name not in scored]
@@ -340,7 +340,7 @@ class Evaluate:
         means = evaluation.summarize(per_mesh, config)
         content = {
             "config": {
-                **evaluation.as_json(config),
+                **asdict(config),
                 "meshes": str(self.meshes) if self.meshes else f"{self.chairs} procedural chairs",
                 "weights": str(self.weights) if self.weights else "chair (packaged)",
                 "seconds": round(time.perf_counter() - start, 1),

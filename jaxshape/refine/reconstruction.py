@@ -102,9 +102,14 @@ def reconstruct_jit(refiner: Refiner | None, config: RefineConfig) -> Callable[.
     return jax.jit(partial(reconstruct, refiner=refiner, config=config))
 
 
+def all_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> bool:
+    """Whether every grid has an occupied voxel, something to rebuild from."""
+    return bool(np.asarray(occupied).any(axis=(-3, -2, -1)).all())
+
+
 def require_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> None:
     """Raise `ValueError` when a grid has no occupied voxel: there is nothing to rebuild from."""
-    if not np.asarray(occupied).any(axis=(-3, -2, -1)).all():
+    if not all_measured(occupied):
         raise ValueError(
             "Nothing was measured inside the object's box: no segmented depth pixel falls into it. "
             "Check the box, the masks, the depth scale and which way the poses go."

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ from jaxshape.model.weights import ShapePrior
 from jaxshape.refine.reconstruction import (
     Method,
     RefineConfig,
+    all_measured,
     reconstruct_jit,
     refiner_for,
 )
@@ -66,7 +67,7 @@ def observe(model: Model, config: EvaluateConfig) -> Case | None:
     merged = fusion.merge_cumulative(measure_frames(captured))
     chosen = jax.tree.map(lambda x: x[np.array(config.frames) - 1], merged)
     occupied = fusion.occupied(chosen)
-    if not occupied.any(axis=(1, 2, 3)).all():
+    if not all_measured(occupied):
         return None
     surface = jnp.broadcast_to(captured.surface, occupied.shape)
     return Case(occupied, fusion.occluded(chosen), surface)
@@ -149,11 +150,6 @@ def summarize(per_mesh: Sequence[dict[str, Any]], config: EvaluateConfig) -> dic
         }
         for k in config.frames
     }
-
-
-def as_json(config: EvaluateConfig) -> dict[str, Any]:
-    """The settings as plain values."""
-    return asdict(config)
 
 
 # A long evaluation keeps its scores in a journal beside the results file until that is written.

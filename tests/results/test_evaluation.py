@@ -1,7 +1,7 @@
 """Scores of methods on meshes: what goes into the results file, and that it is well defined."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import jax
 import numpy as np
@@ -14,7 +14,6 @@ from jaxshape.refine.config import RefineConfig
 from jaxshape.results import evaluation
 from jaxshape.results.evaluation import (
     EvaluateConfig,
-    as_json,
     evaluate,
     observe,
     read_journal,
@@ -67,7 +66,7 @@ def test_means_are_means(scores):
 
 
 def test_results_are_json(scores):
-    content = {"config": as_json(CONFIG), "per_mesh": scores, "means": summarize(scores, CONFIG)}
+    content = {"config": asdict(CONFIG), "per_mesh": scores, "means": summarize(scores, CONFIG)}
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again["per_mesh"] == scores and again["config"]["refine"]["iterations"] == 2
 
