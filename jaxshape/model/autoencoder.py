@@ -7,6 +7,7 @@ imported here and nowhere else.
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -16,10 +17,22 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from jaxshape.geometry.grid import RESOLUTION
-from jaxshape.model.convolution import KERNEL_SIZE, downsample, upsample
+from jaxshape.model.chunks import in_chunks
+from jaxshape.model.convolution import (
+    KERNEL_SIZE,
+    PreparedKernel,
+    downsample,
+    prepare_kernel,
+    upsample,
+    upsample_prepared,
+)
 
-CODES_AT_A_TIME = 2
-"""Codes or grids that go through the network together on CPU, so that layers stay in cache."""
+CODES_AT_A_TIME = 8
+"""Codes or grids that go through the network together on CPU: enough rows for its products, few
+enough that its memory stays small; layers that need fewer to stay in cache take them in turn."""
+
+NORM_EPSILON = 1e-5
+"""Added to variances by batch normalisation, Flax's default."""
 
 LEAKY_SLOPE = 0.2
 """Not given in the paper; that of the networks whose initialisation it uses (DCGAN)."""
@@ -110,6 +123,7 @@ def _normalize(x, train, name):
     norm = nn.BatchNorm(
         use_running_average=not train,
         momentum=0.9,
+        epsilon=NORM_EPSILON,
         scale_init=lambda *args: 1 + WEIGHT_INIT(*args),
         dtype=x.dtype,
         name=name,
@@ -146,25 +160,69 @@ def encode(
     return _over_leading_axes(apply, grid.astype(jnp.float32), 3)
 
 
+class PreparedDecoder(NamedTuple):
+    """A decoder for many calls, with everything done that does not depend on the code.
+
+    Batch normalisation is folded into the layer before it.
+    """
+
+    first: Float[Array, "4 4 4 channels d"]
+    kernels: tuple[PreparedKernel, ...]
+    biases: tuple[Float[Array, "..."], ...]
+    """One per layer; the last is the output's, a scalar."""
+
+
+def prepare_decoder(params: PyTree, dtype: DTypeLike = jnp.float32) -> PreparedDecoder:
+    """Make a decoder ready for a search, with products in the given precision."""
+    weights, statistics = params["params"]["decoder"], params["batch_stats"]["decoder"]
+    kernels, biases = [], []
+    layers = len([name for name in weights if name.startswith("conv")])
+    for i in range(layers - 1):
+        norm, seen = weights[f"norm{i}"], statistics[f"norm{i}"]
+        scale = norm["scale"] * lax.rsqrt(seen["var"] + NORM_EPSILON)
+        kernels.append((weights[f"conv{i}"] * scale[:, None]).astype(dtype))
+        biases.append(norm["bias"] - seen["mean"] * scale)
+    kernels.append(weights[f"conv{layers - 1}"].astype(dtype))
+    first, *rest = kernels
+    return PreparedDecoder(
+        first[1:, 1:, 1:],
+        tuple(prepare_kernel(kernel, 4 * 2**i) for i, kernel in enumerate(rest)),
+        (*biases, weights["bias"]),
+    )
+
+
 def decode(
-    params: PyTree, code: Float[Array, "*batch d"], *, dtype: DTypeLike = jnp.float32
+    params: PyTree | PreparedDecoder,
+    code: Float[Array, "*batch d"],
+    *,
+    dtype: DTypeLike = jnp.float32,
 ) -> Float[Array, "*batch x y z"]:
     """**Logits** of the occupancy that a code stands for; occupied where positive.
 
     The paper's output in (0, 1) is `jax.nn.sigmoid(logits)`. However many leading axes the codes
     have, they are decoded by one call; on CPU it works through them a few at a time, so that its
-    memory does not grow with the population.
+    memory does not grow with the population. A decoder that was prepared already has its precision.
     """
-    network = AutoEncoder(architecture_of(params), dtype)
-    apply = lambda code: network.apply(params, code, method="decode")  # noqa: E731
-    return _over_leading_axes(apply, code, 1)
+    decoder = params if isinstance(params, PreparedDecoder) else prepare_decoder(params, dtype)
+    return _over_leading_axes(partial(_decode, decoder), code, 1)
+
+
+def _decode(decoder: PreparedDecoder, code: Float[Array, "b d"]) -> Float[Array, "b x y z"]:
+    dtype = decoder.first.dtype
+    x = jnp.einsum(
+        "bd,xyzcd->bxyzc", code.astype(dtype), decoder.first, preferred_element_type=jnp.float32
+    )
+    *biases, last = decoder.biases
+    for kernel, bias in zip(decoder.kernels, biases, strict=True):
+        x = upsample_prepared(nn.leaky_relu(x + bias, LEAKY_SLOPE).astype(dtype), kernel)
+    # The output layer is (tanh(x) + 1) / 2 = sigmoid(2 x); 2 x is its logit.
+    return 2.0 * (x[..., 0].astype(jnp.float32) + last)
 
 
 def _over_leading_axes(function, x, core_axes):
     """Apply a function of `[b, ...]` to any leading axes, on CPU a few examples at a time."""
     batch, core = x.shape[: x.ndim - core_axes], x.shape[x.ndim - core_axes :]
     flat = x.reshape(-1, *core)
-    one = lambda x: function(x[None])[0]  # noqa: E731
-    in_chunks = lambda flat: lax.map(one, flat, batch_size=CODES_AT_A_TIME)  # noqa: E731
-    out = lax.platform_dependent(flat, cpu=in_chunks, default=function)
+    chunked = partial(in_chunks, function, CODES_AT_A_TIME)
+    out = lax.platform_dependent(flat, cpu=chunked, default=function)
     return out.reshape(*batch, *out.shape[1:])

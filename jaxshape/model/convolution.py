@@ -2,9 +2,15 @@
 
 `downsample` halves a grid and `upsample` doubles it; each is the adjoint of the other, which is
 all that is needed to differentiate them. XLA's CPU backend runs the same operations up to 300
-times slower than the hardware allows, so there they are written as products of gathered
-neighbourhoods, a few examples at a time so that temporaries stay in cache. Every other backend
-uses XLA's own convolutions.
+times slower than the hardware allows, so there they are written as matrix products, a few
+examples at a time so that temporaries stay in cache:
+
+- Grids of 8 or more coarse voxels a side go through fast convolution (`tiles`). That is
+  linear in the grid and in the kernel, so its transposes are the other direction and the gradient.
+- Smaller grids, where transforming the kernel costs more than it saves, gather neighbours.
+- The last layer, with a single fine channel, multiplies first and then shifts the products.
+
+Every other backend uses XLA's own convolutions.
 
 Grids are channels-last, `[b, x, y, z, channels]`; kernels are `[5, 5, 5, fine, coarse]` for both
 directions, where `fine` counts the channels of the larger grid. Coarse voxel `i` touches the fine
@@ -14,16 +20,25 @@ voxels `2 i + k - 2`, for taps `k` in 0..4 along each axis.
 import itertools
 from collections.abc import Callable
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxshape.model.chunks import in_chunks, sum_chunks
+from jaxshape.model.tiles import (
+    TILE,
+    downsample_tiles,
+    gradient_of_tiles,
+    transform_kernel,
+    upsample_tiles,
+)
+
 KERNEL_SIZE = 5
-CACHE_BYTES = 2 * 2**20
-"""Gathered temporaries on CPU are kept below this; measured best between 1 and 4 MiB."""
+CACHE_BYTES = 4 * 2**20
+"""Temporaries on CPU are kept below this; measured best between 2 and 8 MiB."""
 
 # Fine voxel 2 i + phase takes, from the coarse voxel i + shift, this tap of the kernel:
 TAPS = {-1: {0: 4}, 0: {0: 2, 1: 3}, 1: {0: 0, 1: 1}}
@@ -44,6 +59,39 @@ def upsample(
 ) -> Float[Array, "b 2*x 2*y 2*z fine"]:
     """Convolve transposed with stride 2, padding 2 and output padding 1."""
     return lax.platform_dependent(coarse, kernel, cpu=_upsample_cpu, default=_upsample_xla)
+
+
+class PreparedKernel(NamedTuple):
+    """A kernel for many calls of `upsample_prepared`, with what need not be done again for each."""
+
+    kernel: Float[Array, "5 5 5 fine coarse"]
+    tiles: Float[Array, "36 taps phases"] | None
+    """The transformed kernel, where fast convolution pays once the transform is free."""
+
+
+def prepare_kernel(kernel: Float[Array, "5 5 5 fine coarse"], side: int) -> PreparedKernel:
+    """Make a kernel ready for coarse grids of `side` voxels along each axis.
+
+    Tiles compute in float32; bfloat16 kernels stay products of gathered neighbours, which is what
+    hardware for bfloat16 is fast at.
+    """
+    tiled = kernel.dtype == jnp.float32 and kernel.shape[-2] > 1 and side >= TILE
+    return PreparedKernel(kernel, transform_kernel(kernel) if tiled else None)
+
+
+def upsample_prepared(
+    coarse: Float[Array, "b x y z coarse"], prepared: PreparedKernel
+) -> Float[Array, "b 2*x 2*y 2*z fine"]:
+    """`upsample` with a prepared kernel; differentiable in the grid."""
+    if prepared.tiles is None:
+        return upsample(coarse, prepared.kernel)
+    return lax.platform_dependent(
+        coarse,
+        prepared.kernel,
+        prepared.tiles,
+        cpu=lambda coarse, kernel, tiles: upsample_tiles(coarse, tiles),
+        default=lambda coarse, kernel, tiles: _upsample_xla(coarse, kernel),
+    )
 
 
 def _kernel_gradient(fine, coarse, kernel_like):
@@ -91,27 +139,62 @@ def _kernel_gradient_xla(fine, coarse):
 # ------------------------------------------------------------------ products, for CPU
 
 
+def _upsample_cpu(coarse, kernel):
+    if kernel.shape[-2] == 1:
+        form = lambda coarse: _multiply_then_shift(coarse, kernel)  # noqa: E731
+        return in_chunks(form, _in_cache(KERNEL_SIZE**3 * coarse[0, ..., 0].size), coarse)
+    if _tiled(coarse.shape, kernel.shape):
+        matrices = transform_kernel(kernel)
+        form = lambda x: upsample_tiles(x, matrices).astype(x.dtype)  # noqa: E731
+    else:
+        form = _gather_then_multiply(kernel)
+    return in_chunks(form, _in_cache(9 * coarse[0].size), coarse)
+
+
 def _downsample_cpu(fine, kernel):
-    """Gather the taps along y and z, then add up one product per tap along x."""
-    matrices = kernel.reshape(KERNEL_SIZE, -1, kernel.shape[-1])
-
-    def convolve(fine):
-        planes = _gather_taps(fine)
-        return reduce(jnp.add, map(jnp.matmul, planes, matrices))
-
-    return _in_chunks(convolve, _examples_in_cache(fine), fine)
+    if _tiled([n // 2 for n in fine.shape], kernel.shape):
+        matrices = transform_kernel(kernel)
+        form = lambda x: downsample_tiles(x, matrices).astype(x.dtype)  # noqa: E731
+    else:
+        form = lambda x: _gather_taps_then_multiply(x, kernel)  # noqa: E731
+    return in_chunks(form, _in_cache(25 * fine[0].size // 4), fine)
 
 
 def _kernel_gradient_cpu(fine, coarse):
+    shape = (*[KERNEL_SIZE] * 3, fine.shape[-1], coarse.shape[-1])
+    size = _in_cache(25 * fine[0].size // 4)
+    if not _tiled(coarse.shape, shape):
+        return sum_chunks(_gradient_of_taps, size, fine, coarse).reshape(shape)
+    total = sum_chunks(gradient_of_tiles, size, fine, coarse)
+    return jax.linear_transpose(transform_kernel, jnp.zeros(shape))(total)[0]
+
+
+def _tiled(coarse_shape, kernel_shape) -> bool:
+    """Whether there are tiles enough to be worth the transform of the kernel."""
+    return kernel_shape[-2] > 1 and min(coarse_shape[1:3]) >= 2 * TILE
+
+
+def _in_cache(values: int) -> int:
+    """How many examples can be worked on together that gather so many values each."""
+    return max(1, CACHE_BYTES // (4 * values))
+
+
+def _matmul(a, b):
+    """Products of bfloat16 gather in float32, which is also faster on CPU than in bfloat16."""
+    return jnp.matmul(a, b, preferred_element_type=jnp.float32)
+
+
+def _gather_taps_then_multiply(fine, kernel):
+    """Gather the taps along y and z, then add up one product per tap along x."""
+    matrices = kernel.reshape(KERNEL_SIZE, -1, kernel.shape[-1])
+    return reduce(jnp.add, map(_matmul, _gather_taps(fine), matrices)).astype(fine.dtype)
+
+
+def _gradient_of_taps(fine, coarse):
     """The same gathered taps, against the coarse side, summed over examples."""
-
-    def correlate(fine, coarse):
-        columns = coarse.reshape(-1, coarse.shape[-1])
-        planes = _gather_taps(fine)
-        return jnp.stack([plane.reshape(columns.shape[0], -1).T @ columns for plane in planes])
-
-    total = _sum_chunks(correlate, _examples_in_cache(fine), fine, coarse)
-    return total.reshape(*[KERNEL_SIZE] * 3, fine.shape[-1], coarse.shape[-1])
+    columns = coarse.reshape(-1, coarse.shape[-1])
+    planes = _gather_taps(fine)
+    return jnp.stack([_matmul(plane.reshape(columns.shape[0], -1).T, columns) for plane in planes])
 
 
 def _gather_taps(
@@ -124,16 +207,6 @@ def _gather_taps(
     fine = jnp.concatenate([fine[:, :, :, k : k + nz : 2] for k in taps], axis=-1)
     fine = jnp.concatenate([fine[:, :, k : k + ny : 2] for k in taps], axis=-1)
     return [fine[:, k : k + nx : 2] for k in taps]
-
-
-def _upsample_cpu(coarse, kernel):
-    """Sub-pixel form: each phase of the fine grid is a small convolution of the coarse grid.
-
-    With few output channels the products come first and the shifts act on their few columns;
-    otherwise the shifts along z are gathered first, which makes the products deeper.
-    """
-    convolve = _multiply_then_shift if kernel.shape[-2] < 8 else _gather_then_multiply
-    return _in_chunks(convolve(kernel), _examples_in_cache(coarse), coarse)
 
 
 def _gather_then_multiply(kernel) -> Callable[[Array], Array]:
@@ -151,10 +224,10 @@ def _gather_then_multiply(kernel) -> Callable[[Array], Array]:
         x = jnp.concatenate([x[:, :, :, 1 + d : 1 + d + nz] for d in TAPS], axis=-1)
         phases: dict[tuple, Any] = dict.fromkeys(itertools.product(PHASES, repeat=2), 0.0)
         for (dx, dy), matrix in zip(shifts, matrices, strict=True):
-            product = x[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny] @ matrix
+            product = _matmul(x[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny], matrix)
             for i, phase in enumerate(_taps((dx, dy))):
                 phases[phase] += product[..., 2 * fine * i : 2 * fine * (i + 1)]
-        return _interleave(jnp.stack(list(phases.values()), axis=4), fine)
+        return _interleave(jnp.stack(list(phases.values()), axis=4), fine).astype(kernel.dtype)
 
     return convolve
 
@@ -166,26 +239,36 @@ def _z_matrix(kernel: Float[Array, "5 fine coarse"]) -> Float[Array, "3*coarse 2
     return jnp.concatenate([jnp.concatenate(row, axis=0).T for row in blocks], axis=0)
 
 
-def _multiply_then_shift(kernel) -> Callable[[Array], Array]:
-    """One product with all 125 taps, whose columns are then shifted and added per phase."""
-    fine = kernel.shape[-2]
-    shifts = list(itertools.product(TAPS, repeat=3))
-    columns = [kernel[taps].T for shift in shifts for taps in _taps(shift).values()]
-    matrix = jnp.concatenate(columns, axis=-1)
+def _multiply_then_shift(
+    coarse: Float[Array, "b x y z coarse"], kernel: Float[Array, "5 5 5 1 coarse"]
+) -> Float[Array, "b 2*x 2*y 2*z 1"]:
+    """One product with all 125 taps, then an axis at a time the shifts, which move few values.
 
-    def convolve(x):
-        b, nx, ny, nz, _ = x.shape
-        x = jnp.pad(x, [(0, 0), (1, 1), (1, 1), (1, 1), (0, 0)])
-        product = (x @ matrix).reshape(*x.shape[:-1], len(columns), fine)
-        phases: dict[tuple, Any] = dict.fromkeys(itertools.product(PHASES, repeat=3), 0.0)
-        column = itertools.count()
-        for dx, dy, dz in shifts:
-            shifted = product[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny, 1 + dz : 1 + dz + nz]
-            for phase in _taps((dx, dy, dz)):
-                phases[phase] += shifted[..., next(column), :]
-        return _interleave(jnp.stack(list(phases.values()), axis=4), fine)
+    Voxels come last in the product, so that shifting them is cheap.
+    """
+    b, nx, ny, nz, _ = coarse.shape
+    taps = kernel.reshape(KERNEL_SIZE**3, -1)
+    product = jnp.einsum("kc,bxyzc->kbxyz", taps, coarse, preferred_element_type=jnp.float32)
+    product = product.reshape(*[KERNEL_SIZE] * 3, b, nx, ny, nz)
+    for axis in (4, 5, 6):  # the leading axis of taps becomes a third, fourth or fifth of phases
+        product = jnp.moveaxis(_phases(product, axis), 0, 2)
+    # [px, py, pz, b, x, y, z] to [b, (x, px), (y, py), (z, pz), 1].
+    fine = product.transpose(3, 4, 0, 5, 1, 6, 2).reshape(b, 2 * nx, 2 * ny, 2 * nz, 1)
+    return fine.astype(coarse.dtype)
 
-    return convolve
+
+def _phases(product: Float[Array, "5 ..."], axis: int) -> Float[Array, "2 ..."]:
+    """Add the five taps of one axis to its two phases, each tap from its coarse neighbour."""
+    n = product.shape[axis]
+    pads = [(1, 1) if i == axis else (0, 0) for i in range(1, product.ndim)]
+
+    def neighbour(tap, shift):
+        return lax.slice_in_dim(
+            jnp.pad(product[tap], pads), 1 + shift, 1 + shift + n, axis=axis - 1
+        )
+
+    sums = [[neighbour(TAPS[d][p], d) for d in TAPS if p in TAPS[d]] for p in PHASES]
+    return jnp.stack([reduce(jnp.add, terms) for terms in sums])
 
 
 def _taps(shift: tuple[int, ...]) -> dict[tuple[int, ...], tuple[int, ...]]:
@@ -201,27 +284,3 @@ def _interleave(
     b, nx, ny, nz = phases.shape[:4]
     phases = phases.reshape(b, nx, ny, nz, 2, 2, 2, fine)
     return phases.transpose(0, 1, 4, 2, 5, 3, 6, 7).reshape(b, 2 * nx, 2 * ny, 2 * nz, fine)
-
-
-def _examples_in_cache(grids: Float[Array, "b x y z channels"]) -> int:
-    """How many examples can be gathered at a time: 25 taps, of a grid that shrinks fourfold."""
-    bytes_each = 25 / 4 * grids[0].size * grids.dtype.itemsize
-    return max(1, int(CACHE_BYTES / bytes_each))
-
-
-def _in_chunks(function, size, examples):
-    """Apply a batched function to a few examples at a time."""
-    if examples.shape[0] <= size:
-        return function(examples)
-    return lax.map(lambda x: function(x[None])[0], examples, batch_size=size)
-
-
-def _sum_chunks(function, size, *examples):
-    """Sum a batched function over a few examples at a time, in float32."""
-    b = examples[0].shape[0]
-    size = next(n for n in range(min(size, b), 0, -1) if b % n == 0)
-    chunks = tuple(x.reshape(b // size, size, *x.shape[1:]) for x in examples)
-    out = jax.eval_shape(function, *[x[0] for x in chunks])
-    add = lambda total, chunk: (total + function(*chunk), None)  # noqa: E731
-    total, _ = lax.scan(add, jnp.zeros(out.shape, jnp.float32), chunks)
-    return total

@@ -52,7 +52,8 @@ def load_prior(path: str | os.PathLike[str] | None = None) -> ShapePrior:
     """
     tensors, _ = _read(_path(path))
     mean, covariance = tensors.pop("code_mean", None), tensors.pop("code_covariance", None)
-    params = unflatten({name: jnp.asarray(x, jnp.float32) for name, x in tensors.items()})
+    # Converted by NumPy: JAX would compile a program for each shape.
+    params = unflatten({name: jnp.asarray(x.astype(np.float32)) for name, x in tensors.items()})
     _check(params, mean, covariance, _path(path))
     return ShapePrior(params, jnp.asarray(mean), jnp.asarray(covariance))
 

@@ -26,7 +26,7 @@ def params():
 
 @pytest.fixture(scope="module")
 def grids():
-    """Three grids: an odd number, while on CPU two go through the network together."""
+    """Three grids."""
     return jnp.asarray(np.random.default_rng(0).random((1, 3, 32, 32, 32)) < 0.2)
 
 

@@ -7,32 +7,32 @@ from jaxshape.model import convolution
 from jaxshape.model.convolution import downsample, upsample
 
 BATCH = 5
-COARSE = (2, 3, 1)  # no two axes alike
-FINE = (4, 6, 2)
 
-# Fewer than 8 output channels are upsampled by one form, the others by another.
-CHANNELS = [(3, 2), (8, 3)]
+# Fine and coarse channels, and a coarse grid with no two axes alike, for each form on CPU: one
+# fine channel, few voxels, and enough for tiles (which do not fill the second axis).
+GATHERED, TILED = (3, 2, (2, 3, 1)), (2, 3, (8, 9, 2))
+CASES = [(1, 3, (2, 3, 1)), GATHERED, TILED]
 
 
 def random_array(*shape, seed=0):
     return jnp.float32(np.random.default_rng(seed).normal(size=shape))
 
 
-def example(channels):
-    fine, coarse = channels
+def example(case):
+    fine, coarse, size = case
     return (
-        random_array(BATCH, *FINE, fine),
-        random_array(BATCH, *COARSE, coarse, seed=1),
+        random_array(BATCH, *(2 * n for n in size), fine),
+        random_array(BATCH, *size, coarse, seed=1),
         random_array(5, 5, 5, fine, coarse, seed=2),
     )
 
 
-def touching():
+def touching(size):
     """Every pair of coarse and fine voxels that touch, and the tap between them."""
-    for i in np.ndindex(COARSE):
+    for i in np.ndindex(size):
         for k in np.ndindex(5, 5, 5):
             j = tuple(2 * np.array(i) + k - 2)
-            if all(0 <= a < n for a, n in zip(j, FINE, strict=True)):
+            if all(0 <= a < 2 * n for a, n in zip(j, size, strict=True)):
                 yield i, j, k
 
 
@@ -40,7 +40,7 @@ def looped(fine, coarse, kernel):
     """Both convolutions and the kernel's gradient, one pair of voxels at a time."""
     fine, coarse, kernel = (np.asarray(x, np.float64) for x in (fine, coarse, kernel))
     down, up, gradient = np.zeros(coarse.shape), np.zeros(fine.shape), np.zeros(kernel.shape)
-    for i, j, k in touching():
+    for i, j, k in touching(coarse.shape[1:4]):
         x, y = fine[:, *j], coarse[:, *i]
         down[:, *i] += x @ kernel[k]
         up[:, *j] += y @ kernel[k].T
@@ -71,7 +71,7 @@ def cpu_forms(fine, coarse, kernel):
     )
 
 
-@pytest.fixture(scope="module", params=CHANNELS, ids=str)
+@pytest.fixture(scope="module", params=CASES, ids=str)
 def case(request):
     """An example and what the loops make of it."""
     arrays = example(request.param)
@@ -108,34 +108,36 @@ def test_xlas_convolutions_agree_with_loops(case):
     assert_close(jax.jit(xla_forms)(*arrays), expected)
 
 
-def test_a_few_examples_at_a_time_give_the_same_as_all_at_once(monkeypatch):
-    monkeypatch.setattr(convolution, "_examples_in_cache", lambda grids: 2)
-    arrays = example(CHANNELS[-1])
+@pytest.mark.parametrize("case", [GATHERED, TILED], ids=str)
+def test_a_few_examples_at_a_time_give_the_same_as_all_at_once(monkeypatch, case):
+    monkeypatch.setattr(convolution, "_in_cache", lambda values: 2)
+    arrays = example(case)
     assert BATCH % 2 == 1
     assert_close(jax.jit(lambda *x: cpu_forms(*x))(*arrays), looped(*arrays))
 
 
-@pytest.mark.parametrize("shape", [(32, 32, 32, 1), (8, 8, 8, 32), (4, 4, 4, 128)])
-def test_the_chunks_fill_the_cache_and_no_more(shape):
-    size = convolution._examples_in_cache(jnp.zeros((1, *shape)))
-    gathered = 25 / 4 * np.prod(shape) * 4
-    assert size * gathered <= convolution.CACHE_BYTES < (size + 1) * gathered
+@pytest.mark.parametrize("values", [1, 1000, 10**6])
+def test_the_chunks_fill_the_cache_and_no_more(values):
+    size = convolution._in_cache(values)
+    assert size * values * 4 <= convolution.CACHE_BYTES < (size + 1) * values * 4
 
 
 def test_examples_larger_than_the_cache_go_one_at_a_time():
-    assert convolution._examples_in_cache(jnp.zeros((3, 32, 32, 32, 8))) == 1
+    assert convolution._in_cache(convolution.CACHE_BYTES) == 1
 
 
-def test_bfloat16_stays_close_to_float32():
-    arrays = example(CHANNELS[-1])
+@pytest.mark.parametrize("case", [GATHERED, TILED], ids=str)
+def test_bfloat16_stays_close_to_float32(case):
+    arrays = example(case)
     found = jax.jit(cpu_forms)(*(x.astype(jnp.bfloat16) for x in arrays))
     for a, b in zip(found, looped(*arrays), strict=True):
         error = np.asarray(a, np.float64) - b
         assert 0 < np.sqrt(np.mean(error**2)) < 0.02 * np.sqrt(np.mean(b**2))
 
 
-def test_vmap_over_kernels_equals_a_loop():
-    fine, coarse, kernel = example(CHANNELS[-1])
+@pytest.mark.parametrize("case", [GATHERED, TILED], ids=str)
+def test_vmap_over_kernels_equals_a_loop(case):
+    fine, coarse, kernel = example(case)
     kernels = jnp.stack([kernel, kernel[::-1]])
     both = lambda k: (downsample(fine, k), upsample(coarse, k))  # noqa: E731
     batched = jax.jit(jax.vmap(both))(kernels)

@@ -1,0 +1,43 @@
+"""Batched functions, applied to a few examples at a time so that temporaries stay small."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, PyTree
+
+
+def in_chunks(function: Callable[..., PyTree], size: int, *examples: Array) -> PyTree:
+    """Apply a batched function to at most `size` examples at a time.
+
+    All chunks are equally large, so that the function is compiled once; the last is filled up with
+    zeros, whose results are dropped.
+    """
+    b = examples[0].shape[0]
+    chunks = -(-b // size)
+    if chunks <= 1:
+        return function(*examples)
+    each = -(-b // chunks)
+    out = lax.map(lambda x: function(*x), [_split(x, chunks, each) for x in examples])
+    return jax.tree.map(lambda x: x.reshape(chunks * each, *x.shape[2:])[:b], out)
+
+
+def sum_chunks(function: Callable[..., Array], size: int, *examples: Array) -> Array:
+    """Sum a batched function over at most `size` examples at a time, in float32.
+
+    The function must be additive over examples and zero where they are zero.
+    """
+    chunks = -(-examples[0].shape[0] // size)
+    each = -(-examples[0].shape[0] // max(chunks, 1))
+    split = [_split(x, chunks, each) for x in examples]
+    out: Any = jax.eval_shape(function, *[x[0] for x in split])
+    add = lambda total, chunk: (total + function(*chunk), None)  # noqa: E731
+    total, _ = lax.scan(add, jnp.zeros(out.shape, jnp.float32), split)
+    return total
+
+
+def _split(x: Array, chunks: int, each: int) -> Array:
+    filled = jnp.pad(x, [(0, chunks * each - x.shape[0])] + [(0, 0)] * (x.ndim - 1))
+    return filled.reshape(chunks, each, *x.shape[1:])
