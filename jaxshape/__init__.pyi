@@ -5,32 +5,51 @@ from .data.sequences import open_sequence
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
-from .model.autoencoder import Architecture, decode, encode, initialize
+from .model.autoencoder import (
+    Architecture,
+    PreparedDecoder,
+    decode,
+    encode,
+    initialize,
+    prepare_decoder,
+)
 from .model.weights import ShapePrior, load_prior, save_prior
 from .refine.cma import cma
 from .refine.config import RefineConfig
-from .refine.gradient import gradient
+from .refine.methods import build_refiner
+from .refine.methods.evosax import evosax_strategy
+from .refine.methods.gradient import gradient
+from .refine.methods.hybrid import polished
 from .refine.objective import Target, objective, target
 from .refine.reconstruction import Reconstruction, compose, reconstruct, refiner_for
-from .refine.refiner import Refiner, Trace
-from .refine.run import refine
-from .refine.strategies import evosax_strategy
+from .refine.refiner import Distribution, Refiner, StopReason, Trace
+from .refine.restarts import with_restarts
+from .refine.run import Refined, refine
+from .refine.space import LatentSpace, raw, whitened
+from .refine.stopping import Tolerances
 from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
 from .results.surface import surface, write_mesh
 
 __all__ = [
     "Architecture",
     "Capture",
+    "Distribution",
     "GridFrame",
     "Intrinsics",
+    "LatentSpace",
     "Measurement",
+    "PreparedDecoder",
     "Reconstruction",
     "RefineConfig",
+    "Refined",
     "Refiner",
     "ShapePrior",
+    "StopReason",
     "Target",
+    "Tolerances",
     "Trace",
     "bounds",
+    "build_refiner",
     "capture",
     "chamfer_l1",
     "cma",
@@ -55,8 +74,11 @@ __all__ = [
     "occupied",
     "open_sequence",
     "orbit",
+    "polished",
+    "prepare_decoder",
     "random_chair",
     "random_views",
+    "raw",
     "read_meshes",
     "reconstruct",
     "refine",
@@ -65,5 +87,7 @@ __all__ = [
     "shape_scores",
     "surface",
     "target",
+    "whitened",
+    "with_restarts",
     "write_mesh",
 ]

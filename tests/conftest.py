@@ -7,7 +7,7 @@ import pytest
 
 from jaxshape.model.autoencoder import Architecture, initialize
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine import objective, reconstruction
+from jaxshape.refine import objective, reconstruction, run
 
 
 @pytest.fixture(scope="session")
@@ -42,5 +42,7 @@ def linear_prior():
         patch.setattr(reconstruction, "encode", encode)
         patch.setattr(reconstruction, "decode", decode)
         patch.setattr(objective, "decode", decode)
+        patch.setattr(run, "decode", decode)
+        patch.setattr(run, "prepare_decoder", lambda params: params)
         params = jax.random.normal(jax.random.key(5), (10, 32, 32, 32))
         yield ShapePrior(params, jnp.zeros(10), jnp.eye(10))

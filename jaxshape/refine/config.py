@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Method = Literal["encoder", "gradient", "cma"]
-METHODS: tuple[Method, ...] = ("encoder", "gradient", "cma")
+Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -14,10 +13,23 @@ class RefineConfig:
     objective: Literal["balanced", "paper"] = "balanced"
     """`paper` is Eq. 7 as printed; `balanced` weighs measured occupied voxels three times."""
     iterations: int = 350
-    """Steps of the search (paper: 350)."""
+    """Steps of the search at most (paper: 350)."""
     population: int = 17
-    """Candidates per CMA-ES iteration (pycma's default for 100 dimensions)."""
+    """Candidates per iteration of a population search (pycma's default for 100 dimensions)."""
     sigma0: float = 0.1
-    """First step size of CMA-ES, in standard deviations of the training codes."""
-    step_size: float = 0.14
-    """Of gradient descent, on the codes themselves (paper: 0.14)."""
+    """First standard deviation of a population, in units of the search space."""
+    step_size: float | None = None
+    """Learning rate of gradient methods; the method's own where it is not given."""
+    space: Literal["whitened", "raw"] = "whitened"
+    """Coordinates of the search: those in which the training codes have mean 0 and covariance I, or
+    the codes themselves (paper)."""
+    bound: float | None = None
+    """Keep every coordinate within this distance of 0; in the whitened space, the mean code."""
+    prior_weight: float = 0.0
+    """Of the codes' own distribution: 1 adds its negative log-density to that of the voxels."""
+    tolerance: float = 1e-6
+    """Stop where the objective of recent candidates differs by less than this; 0 never stops."""
+    target: float | None = None
+    """Stop where the objective is this low."""
+    precision: Precision = "float32"
+    """Of the decoder's arithmetic during the search."""

@@ -5,21 +5,23 @@ are worked out once, as a `Target`. `objective` then scores one code; under any 
 becomes one decoder call over all candidates of all objects, with bounded memory.
 """
 
+import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxshape.model.autoencoder import decode
 
 BALANCED_WEIGHT = 3.0
 """Weight of measured occupied voxels in the `balanced` objective; the paper has 1."""
 
-CANDIDATES_AT_A_TIME = {"cpu": 2, "default": 1024}
-"""Candidates decoded together: on CPU as many as keep a layer in cache, else a full device."""
+CANDIDATES_AT_A_TIME = {"cpu": 8, "default": 1024}
+"""Candidates decoded together: on CPU enough rows for its products, else a full device."""
 
 
 class Target(NamedTuple):
@@ -38,9 +40,9 @@ def target(
 ) -> Target:
     """The weights of Eq. 7: F where something was seen, alpha times the prior elsewhere.
 
-    `occupied` is F, `occluded` is M, `prior_logits` the decoded first code,
-    G(lambda_0). `occupied_weight` is 1
-    for the paper's objective; more keeps thin measured structures from drowning in free space.
+    `occupied` is F, `occluded` is M, `prior_logits` the decoded first code, G(lambda_0).
+    `occupied_weight` is 1 for the paper's objective; more keeps thin measured structures from
+    drowning in free space.
     alpha = sum(M) / sum(1 - M); it is 0 where nothing is occluded, and where everything is, the
     sum over no voxels counts as one, so that the prior alone decides.
     """
@@ -58,71 +60,30 @@ def target(
 def cross_entropy(logits: Float[Array, "*batch x y z"], target: Target) -> Float[Array, "*batch"]:
     """Eq. 7 from logits, in nats per voxel: f carries the 1 / N^3 of the training loss."""
     # -log sigmoid(l) = softplus(-l) = softplus(l) - l, and -log(1 - sigmoid(l)) = softplus(l).
-    total = (target.occupied + target.empty) * jax.nn.softplus(logits) - target.occupied * logits
-    return jnp.mean(total, axis=(-3, -2, -1))
+    softplus = jnp.maximum(logits, 0) + jnp.log(1 + jnp.exp(-jnp.abs(logits)))
+    # Sums written as products run several times faster on CPU than what XLA fuses into a mean.
+    over_voxels = partial(jnp.einsum, "...xyz,...xyz->...", precision="highest")
+    total = over_voxels(target.occupied + target.empty, softplus)
+    return (total - over_voxels(target.occupied, logits)) / math.prod(logits.shape[-3:])
 
 
 @jax.custom_vjp
 def objective(params: PyTree, code: Float[Array, " d"], target: Target) -> Float[Array, ""]:
-    """Eq. 7 of one code. Differentiable in the code; parameters and target are constants."""
-    return _loss(params, code, target)
+    """Eq. 7 of one code; NaN, without decoding it, for a code that is not finite.
+
+    Differentiable in the code; parameters and target are constants.
+    """
+    return _losses(params, code[None], _add_axis(target), jnp.zeros(1, jnp.int32))[0]
 
 
-objective.defvjp(
-    lambda params, code, target: _loss_and_slope(params, code, target),
-    lambda slope, ct: (None, ct * slope, None),
-)
-
-
-# `jax.vmap` over candidates, then over objects, would hand the decoder one axis per vmap and keep
-# every candidate's grid in memory. These rules flatten both axes into one and go through it a
-# number of candidates at a time. Only here, at the loss, is the result small enough to keep.
-
-
-@custom_vmap
-def _loss(params, code, target):
-    return _losses(params, code[None], target)[0]
-
-
-@_loss.def_vmap
-def _over_candidates(size, batched, params, codes, target):
-    _require_shared(batched[0])
-    codes = codes if batched[1] else jnp.broadcast_to(codes, (size, *codes.shape))
-    if any(jax.tree.leaves(batched[2])):  # one candidate for each of several objects
-        return _by_chunks(_score, params, codes[:, None], target)[:, 0], True
-    return _losses(params, codes, target), True
-
-
-@custom_vmap
-def _losses(params, codes, target):
-    return _by_chunks(_score, params, codes[None], _add_axis(target))[0]
-
-
-@_losses.def_vmap
-def _over_objects(size, batched, params, codes, target):
-    _require_shared(batched[0])
-    codes = codes if batched[1] else jnp.broadcast_to(codes, (size, *codes.shape))
-    if not any(jax.tree.leaves(batched[2])):
-        target = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), target)
-    return _by_chunks(_score, params, codes, target), True
-
-
-@custom_vmap
-def _loss_and_slope(params, code, target):
-    return jax.tree.map(
-        lambda x: x[0, 0],
-        _by_chunks(_score_and_slope, params, code[None, None], _add_axis(target)),
+def _with_slope(params, code, target):
+    losses, slopes = _losses_and_slopes(
+        params, code[None], _add_axis(target), jnp.zeros(1, jnp.int32)
     )
+    return losses[0], slopes[0]
 
 
-@_loss_and_slope.def_vmap
-def _slopes_over_objects(size, batched, params, codes, target):
-    _require_shared(batched[0])
-    codes = codes if batched[1] else jnp.broadcast_to(codes, (size, *codes.shape))
-    if not any(jax.tree.leaves(batched[2])):
-        target = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), target)
-    scored = _by_chunks(_score_and_slope, params, codes[:, None], target)
-    return jax.tree.map(lambda x: x[:, 0], scored), (True, True)
+objective.defvjp(_with_slope, lambda slope, ct: (None, ct * slope, None))
 
 
 def _score(params, codes, targets):
@@ -134,29 +95,92 @@ def _score_and_slope(params, codes, targets):
     return losses, pull_back(jnp.ones_like(losses))[0]
 
 
-def _by_chunks(score, params, codes: Float[Array, "b n d"], targets: Target):
-    """Score all candidates of all objects, a bounded number at a time."""
-    b, n, _ = codes.shape
+# `jax.vmap` over candidates, then over objects, would hand the decoder one axis per vmap and keep
+# every candidate's grid in memory. Here each vmap only makes more rows, so that any nest of them
+# goes through the decoder a bounded number of candidates at a time. `owner` is the index of each
+# row's target.
 
-    def chunked(size):
-        def go(codes, targets):
-            pick = lambda i: jax.tree.map(lambda x: x[i], targets)  # noqa: E731
-            item = lambda i: jax.tree.map(  # noqa: E731
-                lambda x: x[0], score(params, codes[i // n, i % n][None], _add_axis(pick(i // n)))
+
+def _over_rows(score):
+    """`score` of rows of codes, in bounded memory under any nest of `jax.vmap`s."""
+
+    @custom_vmap
+    def scored(params, codes, targets, owner):
+        branches = {
+            platform: partial(_by_chunks, score, size)
+            for platform, size in CANDIDATES_AT_A_TIME.items()
+        }
+        return lax.platform_dependent(params, codes, targets, owner, **branches)
+
+    @scored.def_vmap
+    def more_rows(size, batched, params, codes, targets, owner):
+        params, is_one = _one_network(params, batched[0])
+        n, shared = len(owner), not any(jax.tree.leaves(batched[2]))
+        codes = codes if batched[1] else jnp.broadcast_to(codes, (size, *codes.shape))
+        if shared:
+            owner = jnp.tile(owner, size)
+        else:
+            targets = jax.tree.map(
+                lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (size, *x.shape)),
+                targets,
+                batched[2],
             )
-            return lax.map(item, jnp.arange(b * n), batch_size=min(size, b * n))
+            count = targets.occupied.shape[1]
+            owner = (owner + count * jnp.arange(size)[:, None]).ravel()
+            targets = jax.tree.map(lambda x: x.reshape(size * count, *x.shape[2:]), targets)
+        out = scored(params, codes.reshape(size * n, -1), targets, owner)
+        out = jax.tree.map(lambda x: x.reshape(size, n, *x.shape[1:]), out)
+        out = jax.tree.map(lambda x: jnp.where(is_one, x, jnp.nan), out)
+        return out, jax.tree.map(lambda _: True, out)
 
-        return go
+    return scored
 
-    branches = {platform: chunked(size) for platform, size in CANDIDATES_AT_A_TIME.items()}
-    scored = lax.platform_dependent(codes, targets, **branches)
-    return jax.tree.map(lambda x: x.reshape(b, n, *x.shape[1:]), scored)
+
+_losses, _losses_and_slopes = _over_rows(_score), _over_rows(_score_and_slope)
+
+
+def _by_chunks(score, size, params, codes, targets, owner):
+    """Score the rows `size` at a time; a chunk without a finite code is passed over.
+
+    Rows whose code is not finite score NaN in any company.
+    """
+    size = -(-len(codes) // -(-len(codes) // size))  # equal chunks: 17 rows go as 3 times 6
+    rows = jnp.arange(-(-len(codes) // size) * size).clip(max=len(codes) - 1).reshape(-1, size)
+    shapes = jax.eval_shape(score, params, codes[:size], _pick(targets, owner[:size]))
+    nothing = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
+
+    def chunk(rows):
+        wanted = jnp.all(jnp.isfinite(codes[rows]), axis=-1)
+
+        def compute():
+            scored = score(params, codes[rows], _pick(targets, owner[rows]))
+            return jax.tree.map(lambda x, y: jax.vmap(jnp.where)(wanted, x, y), scored, nothing)
+
+        return lax.cond(jnp.any(wanted), compute, lambda: nothing)
+
+    scored = lax.map(chunk, rows)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(codes)], scored)
+
+
+def _one_network(params: PyTree, batched: PyTree) -> tuple[PyTree, Bool[Array, ""] | bool]:
+    """The network that a batch shares, and whether it does; a batch of networks scores NaN.
+
+    A branch under `jax.vmap`, as in a line search, copies parameters for each element; compilers
+    take the first of equal copies without making any. Biases and scales stand for the rest.
+    """
+    small = lambda x: x.ndim <= 2  # with the axis of the batch  # noqa: E731
+    same = [
+        jnp.all(x == x[0])
+        for x, is_batched in zip(jax.tree.leaves(params), jax.tree.leaves(batched), strict=True)
+        if is_batched and small(x)
+    ]
+    first = jax.tree.map(lambda x, is_batched: x[0] if is_batched else x, params, batched)
+    return first, jnp.all(jnp.stack(same)) if same else True
+
+
+def _pick(targets: Target, owner: Int[Array, " n"]) -> Target:
+    return jax.tree.map(lambda x: x[owner], targets)
 
 
 def _add_axis(target: Target) -> Target:
     return jax.tree.map(lambda x: x[None], target)
-
-
-def _require_shared(batched: PyTree) -> None:
-    if any(jax.tree.leaves(batched)):
-        raise ValueError("The decoder's parameters are shared by a batch; vmap over codes only.")

@@ -7,16 +7,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.cma import cma
-from jaxshape.refine.config import Method, RefineConfig
-from jaxshape.refine.gradient import gradient
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.methods import build_refiner
 from jaxshape.refine.objective import BALANCED_WEIGHT, cross_entropy, target
 from jaxshape.refine.refiner import Refiner, Trace
-from jaxshape.refine.run import refine
+from jaxshape.refine.run import Penalty, refine
+from jaxshape.refine.space import LatentSpace, raw, whitened
 
 
 class Reconstruction(NamedTuple):
@@ -37,6 +38,10 @@ class Reconstruction(NamedTuple):
     """Eq. 7, in nats per voxel, of the first and of the refined code."""
     trace: Trace | None
     """Of the search, per object and iteration; None for the encoder alone."""
+    iterations: Int[Array, " object"] | None
+    """How many iterations the search took."""
+    stop: Int[Array, " object"] | None
+    """Why it ended, a `StopReason`."""
 
 
 def compose(
@@ -48,16 +53,28 @@ def compose(
     return jnp.where(occluded, completed, occupied)
 
 
-def refiner_for(method: Method, prior: ShapePrior, config: RefineConfig) -> Refiner | None:
-    """The search of a method; none for the encoder alone."""
-    if method == "cma":
-        return cma(
-            dim=len(prior.code_mean),
-            sigma0=config.sigma0,
-            population=config.population,
-            covariance=np.asarray(prior.code_covariance, np.float64),
-        )
-    return gradient(config.step_size) if method == "gradient" else None
+def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner | None:
+    """The search of a method (`methods`); none for "encoder", which only proposes a code."""
+    if method == "encoder":
+        return None
+    return build_refiner(method, len(prior.code_mean), config)
+
+
+def search_space(prior: ShapePrior, config: RefineConfig) -> LatentSpace:
+    """The coordinates in which codes are searched."""
+    if config.space == "whitened":
+        return whitened(prior, config.bound)
+    return raw(len(prior.code_mean), config.bound)
+
+
+def unlikeliness(prior: ShapePrior, weight: float) -> Penalty:
+    """What a code costs for lying far from those of the training set.
+
+    Half its squared Mahalanobis distance, its negative log-density up to a constant, in nats per
+    voxel as the objective is: with weight 1 the sum of both is least at the most probable code.
+    """
+    space, voxels = whitened(prior), RESOLUTION**3
+    return lambda code: weight / voxels * 0.5 * jnp.sum(space.from_code(code) ** 2)
 
 
 def reconstruct(
@@ -78,11 +95,25 @@ def reconstruct(
     targets = target(occupied, occluded, first_logits, occupied_weight=weight)
     first_objective = cross_entropy(first_logits, targets)
     if refiner is None:
-        code, logits, objective, trace = first_code, first_logits, first_objective, None
+        code, logits, objective, found = first_code, first_logits, first_objective, None
     else:
-        found = refine(keys, prior.params, first_code, targets, refiner, config.iterations)
-        code, objective, trace = found.code, found.loss, found.trace
-        logits = decode(prior.params, code)
+        # A prior adds to the objective, and a bound may move the first code.
+        is_first_loss = not config.prior_weight and config.bound is None
+        found = refine(
+            keys,
+            prior.params,
+            first_code,
+            targets,
+            refiner,
+            config.iterations,
+            space=search_space(prior, config),
+            penalty=unlikeliness(prior, config.prior_weight),
+            first_losses=first_objective if is_first_loss else None,
+            target_loss=config.target,
+            precision=config.precision,
+        )
+        code, logits = found.code, found.logits
+        objective = cross_entropy(logits, targets)
     completed = logits > 0
     return Reconstruction(
         first_code=first_code,
@@ -93,7 +124,9 @@ def reconstruct(
         composed=compose(occupied, occluded, completed),
         first_objective=first_objective,
         objective=objective,
-        trace=trace,
+        trace=found and found.trace,
+        iterations=found and found.iterations,
+        stop=found and found.stop,
     )
 
 

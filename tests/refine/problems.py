@@ -1,7 +1,36 @@
 """Test functions with their minimum 0, and the loop that every refiner test runs."""
 
+import math
+
 import jax
 import jax.numpy as jnp
+import pytest
+
+from jaxshape.refine.refiner import StopReason
+from jaxshape.refine.stopping import Tolerances
+
+NEVER = Tolerances(
+    tolfun=0.0,
+    tolfunhist=0.0,
+    tolx=0.0,
+    tolxstagnation=0.0,
+    tolstagnation=False,
+    tolfacupx=math.inf,
+    tolupsigma=math.inf,
+    tolconditioncov=math.inf,
+    tolflatfitness=math.inf,
+    noeffect=False,
+)
+"""No criterion ends a search."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compilation():
+    """Most of the time here is the compiler's; its optimisations are not what is tested."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 def sphere(x):
@@ -21,15 +50,24 @@ def rastrigin(x):
     return jnp.sum(x**2 + 10 * (1 - jnp.cos(2 * jnp.pi * x)))
 
 
+def advance(refiner, objective, key, state, trace):
+    """One iteration; nothing where the search has stopped, as in `jaxshape.refine.run`."""
+    running = state.stop == StopReason.RUNNING
+    moved = refiner.step(key, state, objective)
+    return jax.tree.map(lambda new, old: jnp.where(running, new, old), moved, (state, trace))
+
+
 def run(refiner, objective, key, code, iterations):
     """One search over one code: the final state, and the trace over the iterations."""
 
-    def body(state, key):
-        return refiner.step(key, state, objective)
+    def body(now, key):
+        state, trace = advance(refiner, objective, key, *now)
+        return (state, trace), trace
 
     init_key, loop_key = jax.random.split(key)
-    state = refiner.init(init_key, code, objective(code))
-    return jax.lax.scan(body, state, jax.random.split(loop_key, iterations))
+    started = refiner.init(init_key, code, objective(code))
+    (state, _), traces = jax.lax.scan(body, started, jax.random.split(loop_key, iterations))
+    return state, traces
 
 
 def run_batch(refiner, objective_of, key, codes, iterations, *data):

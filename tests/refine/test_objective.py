@@ -1,5 +1,7 @@
 """Eq. 7 against the paper in NumPy, and under every nesting of transformations."""
 
+from functools import partial
+
 import jax
 import jax.extend as jex
 import jax.numpy as jnp
@@ -150,13 +152,16 @@ def test_leading_axes_are_a_batch():
 # --- the objective over codes, with a decoder that compiles at once -----------------------------
 
 OBJECTS, CANDIDATES, D = 3, 5, 6
-PARAMS = {"kernel": jnp.asarray(rng.normal(size=(D, *SHAPE)), jnp.float32)}
+PARAMS = {
+    "kernel": jnp.asarray(rng.normal(size=(D, *SHAPE)), jnp.float32),
+    "bias": jnp.asarray(rng.normal(size=SHAPE[-1:]), jnp.float32),
+}
 CODES = jnp.asarray(rng.normal(size=(OBJECTS, CANDIDATES, D)), jnp.float32)
 TARGETS = target(*random_grids(2, OBJECTS), random_logits(OBJECTS))
 
 
 def quick_decode(params, code):
-    return jnp.tanh(jnp.tensordot(code, params["kernel"], 1)) * 3
+    return jnp.tanh(jnp.tensordot(code, params["kernel"], 1) + params["bias"]) * 3
 
 
 def of_object(i):
@@ -270,10 +275,86 @@ def test_the_slope_scales_with_what_comes_after(decoded):
     np.testing.assert_allclose(slope, expected, rtol=1e-4)
 
 
-def test_a_batch_of_parameters_is_refused(decoded):
-    many = jax.tree.map(lambda x: jnp.stack([x, x]), PARAMS)
-    with pytest.raises(ValueError, match="vmap over codes only"):
-        jax.vmap(objective, in_axes=(0, None, None))(many, CODES[0, 0], of_object(0))
+def test_three_levels_of_nesting_and_any_mixture_of_axes(decoded):
+    codes = jnp.stack([CODES, CODES + 1, -CODES, CODES / 2])  # 4 starts of 3 objects of 5
+    many = jax.vmap(over_objects(over_candidates(objective)), in_axes=(None, 0, None))
+    losses = jax.jit(many)(PARAMS, codes, TARGETS)
+    plain_loss = jax.jit(plain)
+    for a, i, k in np.ndindex(losses.shape):
+        expected = plain_loss(PARAMS, codes[a, i, k], of_object(i))
+        np.testing.assert_allclose(losses[a, i, k], expected, rtol=1e-5)
+
+    # The same codes with their axes the other way round, and the objects innermost.
+    inside_out = jax.vmap(over_candidates(over_objects(objective)), in_axes=(None, 3, None))
+    turned = jax.jit(inside_out)(PARAMS, codes.transpose(2, 1, 3, 0), TARGETS)
+    np.testing.assert_allclose(turned, losses.transpose(0, 2, 1), rtol=1e-5)
+
+
+def test_only_one_part_of_a_target_may_be_batched(decoded):
+    one = of_object(0)
+    in_axes = (None, 0, Target(occupied=0, empty=None))
+    losses = jax.jit(jax.vmap(objective, in_axes=in_axes))(
+        PARAMS, CODES[:, 0], Target(TARGETS.occupied, one.empty)
+    )
+    for i in range(OBJECTS):
+        expected = plain(PARAMS, CODES[i, 0], Target(TARGETS.occupied[i], one.empty))
+        np.testing.assert_allclose(losses[i], expected, rtol=1e-5)
+
+
+def test_equal_networks_are_one_and_different_ones_score_nan(decoded):
+    scored = jax.jit(jax.vmap(objective, in_axes=(0, None, None)))
+    same = jax.tree.map(lambda x: jnp.stack([x, x]), PARAMS)
+    expected = plain(PARAMS, CODES[0, 0], of_object(0))
+    np.testing.assert_allclose(scored(same, CODES[0, 0], of_object(0)), expected, rtol=1e-5)
+    different = jax.tree.map(lambda x: jnp.stack([x, 2 * x]), PARAMS)
+    assert np.all(np.isnan(scored(different, CODES[0, 0], of_object(0))))
+
+
+def test_a_branch_that_vmap_turns_into_a_select_keeps_its_losses(decoded):
+    """Under vmap a conditional copies the network for each element, as line searches do."""
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(0, 0, 0))
+    def of_one(wanted, codes, target):
+        def slopes():
+            return jax.vmap(jax.grad(objective, argnums=1), in_axes=(None, 0, None))(
+                PARAMS, codes, target
+            )
+
+        return jax.lax.cond(wanted, slopes, lambda: jnp.zeros_like(codes))
+
+    wanted = jnp.array([True, False, True])
+    expected = np.where(wanted[:, None, None], expected_slopes(), 0)
+    np.testing.assert_allclose(of_one(wanted, CODES, TARGETS), expected, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("at_a_time", [1, 2, 3, 15, 100])
+def test_codes_that_are_not_finite_score_nan_and_cost_nothing(monkeypatch, at_a_time):
+    """Only chunks with a finite code are decoded; the others of a chunk score as ever."""
+    decoded = []
+
+    def counting_decode(params, code):
+        rows = code.size // D
+        jax.debug.callback(lambda: decoded.append(rows))
+        return jnp.nan_to_num(quick_decode(params, code))  # a decoder that hides what it was given
+
+    monkeypatch.setattr(module, "decode", counting_decode)
+    monkeypatch.setattr(module, "CANDIDATES_AT_A_TIME", {"cpu": at_a_time, "default": at_a_time})
+    finite = rng.random((OBJECTS, CANDIDATES)) < 0.4
+    finite[1] = False
+    failures = rng.choice([np.nan, np.inf, -np.inf], (OBJECTS, CANDIDATES))
+    codes = CODES.at[..., 2].set(jnp.where(finite, CODES[..., 2], failures))
+    slope = jax.value_and_grad(objective, argnums=1)
+    losses, slopes = jax.jit(over_objects(over_candidates(slope)))(PARAMS, codes, TARGETS)
+    jax.effects_barrier()
+
+    size = min(at_a_time, finite.size)
+    rows = np.pad(finite.ravel(), (0, -finite.size % size), constant_values=finite.ravel()[-1])
+    assert sum(decoded) == size * np.count_nonzero(rows.reshape(-1, size).any(axis=1))
+    expected = np.where(finite, expected_losses(), np.nan)
+    np.testing.assert_allclose(losses, expected, rtol=1e-5)
+    expected = np.where(finite[..., None], expected_slopes(), np.nan)
+    np.testing.assert_allclose(slopes, expected, rtol=1e-4, atol=1e-7)
 
 
 def equations_inside(jaxpr):

@@ -10,14 +10,17 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
 from jaxshape.refine import reconstruction
-from jaxshape.refine.config import METHODS, RefineConfig
+from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.objective import cross_entropy, target
 from jaxshape.refine.reconstruction import (
     compose,
     reconstruct_jit,
     refiner_for,
     require_measured,
+    search_space,
+    unlikeliness,
 )
+from jaxshape.refine.refiner import StopReason
 
 KEY = jax.random.key(0)
 KEYS = jax.random.split(KEY, 2)
@@ -39,6 +42,7 @@ def searched(linear_prior):
     )
 
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
 grids = arrays(bool, (3, 4, 2))
 
 
@@ -57,7 +61,7 @@ def test_the_encoder_alone_answers_with_its_first_code(linear_prior, encoded):
     np.testing.assert_array_equal(encoded.code, encoded.first_code)
     np.testing.assert_array_equal(encoded.completed, encoded.completed_first)
     np.testing.assert_array_equal(encoded.objective, encoded.first_objective)
-    assert encoded.trace is None and refiner_for("encoder", linear_prior, CONFIG) is None
+    assert encoded.trace is None and encoded.iterations is None and encoded.stop is None
     assert 0.01 < encoded.completed.mean() < 0.99  # the prior says something
 
 
@@ -88,20 +92,101 @@ def test_the_paper_objective_weighs_measured_voxels_once(linear_prior, encoded):
     assert np.all(printed.objective < encoded.objective)
 
 
-def test_each_method_has_its_search_with_the_settings_asked_for(linear_prior):
-    config = RefineConfig(sigma0=0.7, step_size=0.01)
-    wide = linear_prior._replace(code_covariance=4 * linear_prior.code_covariance)
-    code, loss = jnp.zeros(10), jnp.asarray(1.0)
-    state = refiner_for("cma", wide, config).init(KEY, code, loss)
+def test_the_search_is_set_up_as_asked(linear_prior):
+    assert refiner_for("encoder", linear_prior, CONFIG) is None
+    refiner = refiner_for("cma", linear_prior, replace(CONFIG, sigma0=0.7))
+    state, _ = refiner.init(KEY, jnp.zeros(10), jnp.asarray(1.0))
     assert state.sigma == pytest.approx(0.7)
-    many = refiner_for("cma", wide, replace(config, population=400))
-    _, trace = jax.jit(lambda state: many.step(KEY, state, jnp.sum))(state)
-    assert trace.spread == pytest.approx(1.4, rel=0.05)  # 0.7 deviations of the training codes
+    with pytest.raises(ValueError, match="no method 'anneal'"):
+        refiner_for("anneal", linear_prior, CONFIG)
 
-    descent = refiner_for("gradient", linear_prior, config)
-    state, _ = descent.step(KEY, descent.init(KEY, code, loss), jnp.sum)
-    np.testing.assert_allclose(state.mean, np.full(10, -0.01))
-    assert METHODS == ("encoder", "gradient", "cma")
+
+# --- the space of the search ----------------------------------------------------------------------
+
+ROOT = jnp.tril(jax.random.normal(jax.random.key(3), (10, 10))) + 3 * jnp.eye(10)
+MEAN = jnp.arange(10.0)
+
+
+@pytest.fixture(scope="module")
+def skewed(linear_prior):
+    """A prior whose codes have a mean and a covariance of their own."""
+    return linear_prior._replace(code_mean=MEAN, code_covariance=ROOT @ ROOT.T)
+
+
+def searching(prior, method="cma", **settings):
+    config = replace(CONFIG, **settings)
+    run = reconstruct_jit(refiner_for(method, prior, config), config)
+    return run(KEYS, prior, OCCUPIED, OCCLUDED)
+
+
+def mahalanobis(code):
+    """Squared, in float64."""
+    covariance = np.asarray(ROOT, np.float64) @ np.asarray(ROOT, np.float64).T
+    apart = np.asarray(code, np.float64) - np.asarray(MEAN)
+    return np.einsum("...i,ij,...j->...", apart, np.linalg.inv(covariance), apart)
+
+
+def test_in_the_whitened_space_sigma0_is_in_deviations_of_the_training_codes(skewed):
+    config = replace(CONFIG, population=2000, sigma0=0.1)
+    space = search_space(skewed, config)
+    points = 0.1 * jax.random.normal(KEY, (4000, 10))
+    codes = jax.vmap(space.to_code)(points)
+    np.testing.assert_allclose(np.cov(codes.T) / 0.01, ROOT @ ROOT.T, rtol=0.2, atol=1)
+    np.testing.assert_allclose(mahalanobis(codes), np.sum(points**2, axis=1), rtol=1e-2, atol=1e-4)
+    np.testing.assert_allclose(codes.mean(axis=0), MEAN, atol=0.05)
+
+
+def test_in_the_raw_space_points_are_codes(skewed):
+    space = search_space(skewed, replace(CONFIG, space="raw"))
+    np.testing.assert_array_equal(space.to_code(MEAN), MEAN)
+    found = searching(skewed, "gradient", space="raw", step_size=0.1, iterations=1)
+    assert np.all(found.objective < found.first_objective)
+    slope = jax.grad(
+        lambda code: jnp.sum(
+            cross_entropy(
+                reconstruction.decode(skewed.params, code),
+                target(OCCUPIED, OCCLUDED, reconstruction.decode(skewed.params, found.first_code)),
+            )
+        )
+    )(found.first_code)
+    np.testing.assert_allclose(found.code, found.first_code - 0.1 * slope, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("space", ["whitened", "raw"])
+def test_a_bound_holds_every_coordinate(skewed, space):
+    """The first code lies outside and is moved in, where the trace begins."""
+    settings = {"space": space, "step_size": 0.3, "iterations": 6}
+    found = searching(skewed, "gradient", bound=0.3, **settings)
+    free = search_space(skewed, replace(CONFIG, space=space))
+    first, last = (jax.vmap(free.from_code)(x) for x in (found.first_code, found.code))
+    assert np.all(np.abs(last) <= 0.3001)
+    assert np.all(np.abs(first).max(axis=1) > 0.31) and np.any(np.abs(last) > 0.2)
+    assert np.all(found.objective < found.trace.loss[:, 0])
+
+
+def test_the_prior_pulls_codes_to_their_mean(skewed):
+    """Its weight counts nats: half the squared Mahalanobis distance, once per grid."""
+    code = MEAN + ROOT @ jnp.linspace(-1, 1, 10)
+    penalty = unlikeliness(skewed, 2.0)(code)
+    np.testing.assert_allclose(penalty, 2 * 0.5 * mahalanobis(code) / 32**3, rtol=1e-4)
+    assert unlikeliness(skewed, 2.0)(MEAN) == 0
+
+    distances = []
+    for weight in (0.0, 1e7):
+        found = searching(skewed, "gradient", iterations=8, prior_weight=weight, step_size=3e-3)
+        distances.append(mahalanobis(found.code))
+        if weight:  # the loss of the search is the sum of both
+            total = found.objective + jax.vmap(unlikeliness(skewed, weight))(found.code)
+            assert np.all(total <= found.trace.best_loss[:, -1] * 1.0001)
+    assert np.all(distances[0] > 1) and np.all(distances[1] < 1e-3)
+
+
+def test_a_target_ends_the_search(linear_prior, encoded):
+    goal = float(encoded.objective.mean())  # one object is there from the start
+    found = searching(linear_prior, "gradient", target=goal, step_size=1e-9, tolerance=0.0)
+    done = np.asarray(encoded.objective) <= goal
+    np.testing.assert_array_equal(found.iterations, np.where(done, 0, CONFIG.iterations))
+    np.testing.assert_array_equal(found.stop, np.where(done, StopReason.TARGET, StopReason.BUDGET))
 
 
 def test_nothing_measured_is_said_in_a_sentence():

@@ -1,68 +1,75 @@
-"""The refinement loop: what every refiner promises over a batch of objects."""
+"""The refinement loop: what every search promises over a batch of objects."""
 
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
-from jaxshape.refine import objective as objective_module
-from jaxshape.refine.cma import cma
-from jaxshape.refine.gradient import gradient
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.methods import build_refiner
 from jaxshape.refine.objective import cross_entropy, target
+from jaxshape.refine.refiner import StopReason
 from jaxshape.refine.run import refine
-from jaxshape.refine.strategies import evosax_strategy
+from jaxshape.refine.space import LatentSpace
 
 OBJECTS, D, SHAPE, ITERATIONS = 3, 4, (3, 3, 3), 8
 KEYS = jax.random.split(jax.random.key(0), OBJECTS)
+CONFIG = RefineConfig(iterations=ITERATIONS, population=6, sigma0=0.3, tolerance=0.0, space="raw")
 rng = np.random.default_rng(1)
 PARAMS = jnp.asarray(rng.normal(size=(D, *SHAPE)), jnp.float32)
 CODES = jnp.asarray(rng.normal(size=(OBJECTS, D)), jnp.float32)
+TARGETS = target(
+    *jnp.asarray(rng.random((2, OBJECTS, *SHAPE)) < 0.5), jnp.tensordot(CODES, PARAMS, 1)
+)
+METHODS = ["cma", "gradient", "gradient:lbfgs", "evosax:SNES", "hybrid:adam"]  # and `hybrid` below
 
 
-def quick_decode(params, code):
-    """Stands for the network, so that a search compiles at once."""
-    return jnp.tensordot(code, params, 1)
+def searching(method, iterations=ITERATIONS, config=CONFIG, **options):
+    refiner = build_refiner(method, D, config)
+    return jax.jit(partial(refine, refiner=refiner, iterations=iterations, **options))
 
 
-TARGETS = target(*jnp.asarray(rng.random((2, OBJECTS, *SHAPE)) < 0.5), quick_decode(PARAMS, CODES))
-REFINERS = {
-    "cma": cma(dim=D, sigma0=0.3),
-    "gradient": gradient(0.5),
-    "adam": gradient(optax.adam(0.1)),
-    "SNES": evosax_strategy("SNES", dim=D, population=8, sigma0=0.3),
-}
+def loss_of(code, i, targets=TARGETS):
+    one = jax.tree.map(lambda x: x[i], targets)
+    return cross_entropy(jnp.tensordot(code, PARAMS, 1), one)
 
 
-@pytest.fixture(scope="module")
-def traces():
-    return []
+def of_object(i):
+    return jax.tree.map(lambda x: x[i : i + 1], TARGETS)
 
 
-@pytest.fixture(scope="module", params=list(REFINERS))
-def search(request, traces):
-    """A compiled search; the decoder is replaced for as long as any test needs it."""
-    patch = pytest.MonkeyPatch()
+# --- every method -------------------------------------------------------------------------------
 
-    def counting_decode(params, code):
-        traces.append(request.param)
-        return quick_decode(params, code)
 
-    patch.setattr(objective_module, "decode", counting_decode)
-    yield jax.jit(partial(refine, refiner=REFINERS[request.param], iterations=ITERATIONS))
-    patch.undo()
+@pytest.fixture(scope="module", params=METHODS)
+def method(request):
+    return request.param
 
 
 @pytest.fixture(scope="module")
-def refined(search):
-    return search(KEYS, PARAMS, CODES, TARGETS)
+def search(method, decoder):
+    return searching(method)
 
 
-def loss_of(code, i):
-    one = jax.tree.map(lambda x: x[i], TARGETS)
-    return cross_entropy(quick_decode(PARAMS, code), one)
+@pytest.fixture(scope="module")
+def counts(decoder):
+    """Codes decoded by the search of each method."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def refined(method, search, decoder, counts):
+    decoder.codes()
+    found = search(KEYS, PARAMS, CODES, TARGETS)
+    counts[method] = decoder.codes()
+    return found
+
+
+def draws(refined):
+    """Whether the search is random."""
+    return bool(np.any(np.asarray(refined.trace.spread) > 0))
 
 
 def test_the_outcome_is_the_best_code_and_never_worse_than_the_first(refined):
@@ -71,24 +78,35 @@ def test_the_outcome_is_the_best_code_and_never_worse_than_the_first(refined):
         np.testing.assert_allclose(refined.loss[i], loss_of(refined.code[i], i), rtol=1e-5)
         # Where the search stands at last counts too, though no iteration evaluated it.
         assert refined.loss[i] <= loss_of(refined.state.mean[i], i) * (1 + 1e-6)
-    assert np.all(refined.loss <= refined.trace.best_loss[:, -1])
+    np.testing.assert_allclose(refined.logits, jnp.tensordot(refined.code, PARAMS, 1), atol=1e-5)
+    assert np.all(refined.loss <= refined.trace.best_loss[:, -1] * (1 + 1e-6))
 
 
-def test_the_trace_never_rises(refined):
-    assert refined.trace.best_loss.shape == (OBJECTS, ITERATIONS)
-    assert np.all(np.diff(refined.trace.best_loss, axis=1) <= 0)
+def test_the_trace_never_rises_and_counts_what_was_decoded(method, refined, counts):
+    trace = refined.trace
+    assert trace.best_loss.shape == (OBJECTS, ITERATIONS)
+    assert np.all(np.diff(trace.best_loss, axis=1) <= 0)
+    assert np.all(np.diff(trace.evaluations, axis=1) > 0)
+    np.testing.assert_array_equal(refined.iterations, ITERATIONS)
+    np.testing.assert_array_equal(refined.stop, StopReason.BUDGET)
+    np.testing.assert_array_equal(refined.state.stop, StopReason.RUNNING)  # it could go on
+    counted = trace.evaluations[:, -1].sum()
+    if method == "gradient:lbfgs":  # in a batch, line searches wait for the longest
+        assert counted <= counts[method]
+    else:
+        assert counted == counts[method]
 
 
-def test_a_key_decides_the_outcome_and_a_second_call_traces_nothing(search, refined, traces):
-    before = len(traces)
+def test_a_key_decides_the_outcome_and_a_second_call_traces_nothing(search, refined, decoder):
+    before = decoder.traces
     again = search(KEYS, PARAMS, CODES, TARGETS)
     jax.tree.map(np.testing.assert_array_equal, refined, again)
     other = search(jax.random.split(jax.random.key(7), OBJECTS), PARAMS, CODES, TARGETS)
-    if np.any(np.asarray(refined.trace.spread) > 0):  # the search draws at random
+    if draws(refined):
         assert not np.allclose(refined.code, other.code)
     else:
         np.testing.assert_array_equal(refined.code, other.code)
-    assert len(traces) == before > 0
+    assert decoder.traces == before > 0
 
 
 def test_an_object_that_fails_does_not_disturb_the_others(search, refined):
@@ -98,18 +116,158 @@ def test_an_object_that_fails_does_not_disturb_the_others(search, refined):
         np.testing.assert_array_equal(found.code[row], refined.code[row])
         np.testing.assert_array_equal(found.loss[row], refined.loss[row])
     np.testing.assert_array_equal(found.code[1], CODES[1])
-    assert np.isinf(found.loss[1])
-
-
-def test_an_object_alone_finds_what_it_finds_in_company(search, refined):
-    alone = search(KEYS[1:2], PARAMS, CODES[1:2], jax.tree.map(lambda x: x[1:2], TARGETS))
-    np.testing.assert_allclose(alone.code[0], refined.code[1], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(alone.loss[0], refined.loss[1], rtol=1e-5)
+    assert not np.isfinite(found.loss[1])
 
 
 def test_equal_objects_search_by_keys_of_their_own(search, refined):
     same = jax.tree.map(lambda x: jnp.stack([x[0]] * OBJECTS), (CODES, TARGETS))
     found = search(KEYS, PARAMS, *same)
-    if np.any(np.asarray(refined.trace.spread) > 0):
+    if draws(refined):
         assert not np.allclose(found.code[0], found.code[1])
     np.testing.assert_array_equal(found.code[0], refined.code[0])
+
+
+@pytest.mark.parametrize("method", ["cma"], indirect=True)
+def test_an_object_alone_finds_what_it_finds_in_company(search, refined):
+    alone = search(KEYS[1:2], PARAMS, CODES[1:2], of_object(1))
+    np.testing.assert_allclose(alone.code[0], refined.code[1], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(alone.loss[0], refined.loss[1], rtol=1e-4)
+
+
+# --- objects that are done ----------------------------------------------------------------------
+
+LONG = 60
+# One object three times, so that a loss means the same for all; the keys tell them apart.
+SAME_CODES, SAME_TARGETS = jax.tree.map(lambda x: jnp.stack([x[0]] * OBJECTS), (CODES, TARGETS))
+
+
+@pytest.fixture(scope="module")
+def to_goal(decoder):
+    """A search until its loss is that of the last argument."""
+    refiner = build_refiner("cma", D, CONFIG)
+
+    def search(codes, targets, goal, previous=None):
+        return refine(
+            KEYS, PARAMS, codes, targets, refiner, LONG, target_loss=goal, previous=previous
+        )
+
+    return jax.jit(search)
+
+
+@pytest.fixture(scope="module")
+def endless(to_goal):
+    return to_goal(SAME_CODES, SAME_TARGETS, -jnp.inf)
+
+
+def test_an_object_at_its_target_freezes_and_is_no_longer_decoded(to_goal, endless, decoder):
+    """Up to the first iteration at the target, the search is the one without a target."""
+    losses = np.asarray(endless.trace.best_loss)
+    goal = float(losses[:, 12].max())
+    decoder.codes()
+    found = to_goal(SAME_CODES, SAME_TARGETS, goal)
+    count = decoder.codes()
+
+    reached = np.argmax(losses <= goal, axis=1) + 1
+    assert 1 < reached.min() < reached.max() < LONG
+    np.testing.assert_array_equal(found.iterations, reached)
+    np.testing.assert_array_equal(found.stop, StopReason.TARGET)
+    assert count == np.sum(1 + CONFIG.population * reached)
+    for i, last in enumerate(reached):
+        best = np.asarray(found.trace.best_loss[i])
+        np.testing.assert_array_equal(best[:last], losses[i, :last])
+        assert np.all(best[last:] == best[last - 1])
+        assert np.all(found.trace.evaluations[i, last - 1 :] == 1 + CONFIG.population * last)
+        np.testing.assert_array_equal(found.state.best.loss[i], best[last - 1])
+
+
+def test_a_first_code_that_is_good_enough_is_the_answer(to_goal, decoder):
+    decoder.codes()
+    found = to_goal(CODES, TARGETS, 1e9)
+    assert decoder.codes() == OBJECTS  # the first codes
+    np.testing.assert_array_equal(found.iterations, 0)
+    np.testing.assert_array_equal(found.stop, StopReason.TARGET)
+    np.testing.assert_array_equal(found.code, CODES)
+
+
+def test_a_search_that_converged_stops_and_costs_no_quality(to_goal, decoder):
+    full = to_goal(CODES, TARGETS, -jnp.inf)
+    decoder.codes()
+    config = RefineConfig(population=6, sigma0=0.3, tolerance=1e-5)
+    found = searching("cma", 150, config)(KEYS, PARAMS, CODES, TARGETS)
+    assert set(np.asarray(found.stop)) <= {StopReason.TOLFUN, StopReason.TOLFUNHIST}
+    assert np.all(found.iterations < 150) and np.all(found.iterations > 20)
+    assert decoder.codes() == np.sum(1 + 6 * found.iterations)
+    assert np.all(found.loss < full.loss + 1e-4)
+
+
+def test_polishing_counts_towards_the_iterations_of_a_hybrid(decoder):
+    """CMA-ES stops early, the gradient goes on from there, and stops by its own criterion."""
+    config = RefineConfig(population=6, sigma0=0.3, tolerance=1e-5, iterations=150)
+    found = searching("hybrid", 150, config)(KEYS, PARAMS, CODES, TARGETS)
+    np.testing.assert_array_equal(found.stop, StopReason.TOLFUNHIST)
+    handed_over = found.state.searched[0].generation
+    assert np.all(handed_over < 120) and np.all(found.iterations > handed_over)
+    assert np.all(found.loss <= found.state.searched[0].best.loss * (1 + 1e-6))
+
+
+# --- warm starts --------------------------------------------------------------------------------
+
+CHANGED = jax.tree.map(lambda x: x * (1 + 0.1 * jax.random.normal(KEYS[0], x.shape)), SAME_TARGETS)
+
+
+def test_a_warm_start_keeps_the_distribution_and_scores_it_anew(to_goal, endless):
+    before = endless.state
+    found = to_goal(CODES, CHANGED, jnp.inf, previous=before)  # content with the start
+    np.testing.assert_array_equal(found.iterations, 0)
+    for name in ("mean", "sigma", "covariance"):
+        np.testing.assert_array_equal(getattr(found.state, name), getattr(before, name))
+    np.testing.assert_array_equal(found.state.best.point, before.best.point)
+    for i in range(OBJECTS):
+        loss = loss_of(before.best.point[i], i, CHANGED)
+        np.testing.assert_allclose(found.state.best.loss[i], loss, rtol=1e-5)
+        assert not np.isclose(loss, before.best.loss[i], rtol=1e-4)
+
+
+def test_after_a_small_change_a_warm_start_needs_fewer_iterations(to_goal, endless):
+    goal = to_goal(SAME_CODES, CHANGED, -jnp.inf).loss.max() + 1e-3
+    cold = to_goal(SAME_CODES, CHANGED, goal)
+    warm = to_goal(SAME_CODES, CHANGED, goal, previous=endless.state)
+    np.testing.assert_array_equal(cold.stop, StopReason.TARGET)
+    np.testing.assert_array_equal(warm.stop, StopReason.TARGET)
+    assert np.all(2 * warm.iterations < cold.iterations)
+
+
+def test_searches_without_a_resume_begin_again_at_the_best_point(endless):
+    """The losses of the first codes say nothing of where the search begins now."""
+    best, known = endless.state.best.point, jnp.zeros(OBJECTS)
+    again = searching("evosax:SNES", 1)
+    found = again(KEYS, PARAMS, CODES, CHANGED, first_losses=known, previous=endless.state)
+    np.testing.assert_array_equal(found.state.origin, best)
+    for i in range(OBJECTS):
+        assert 0 < found.state.best.loss[i] <= loss_of(best[i], i, CHANGED) * (1 + 1e-5)
+
+
+# --- spaces and penalties -----------------------------------------------------------------------
+
+
+def test_a_space_only_changes_the_coordinates(decoder):
+    """A fixed step in the space u, code = mean + a u, is one of a^2 times its length in codes."""
+    space = LatentSpace(jnp.arange(4.0), 2 * jnp.eye(D))
+    short = searching("gradient", config=RefineConfig(step_size=0.1), space=space)
+    long = searching("gradient", config=RefineConfig(step_size=0.4))
+    short, long = (search(KEYS, PARAMS, CODES, TARGETS) for search in (short, long))
+    np.testing.assert_allclose(short.code, long.code, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(short.loss, long.loss, rtol=1e-4)
+    np.testing.assert_allclose(short.state.mean, (long.state.mean - jnp.arange(4.0)) / 2, atol=1e-4)
+
+
+def test_a_penalty_is_part_of_the_loss(decoder):
+    def penalty(code):
+        return 1e3 * jnp.sum((code - 2) ** 2)
+
+    descent = searching("gradient", config=RefineConfig(step_size=4e-4), penalty=penalty)
+    found = descent(KEYS, PARAMS, CODES, TARGETS)
+    np.testing.assert_allclose(found.code, 2, atol=0.01)
+    for i in range(OBJECTS):
+        expected = loss_of(found.code[i], i) + penalty(found.code[i])
+        np.testing.assert_allclose(found.loss[i], expected, rtol=1e-4)

@@ -1,12 +1,13 @@
-"""The distribution-based strategies of evosax as refiners, for comparison with `cma`."""
+"""The distribution-based strategies of evosax, for comparison: `evosax:Sep_CMA_ES`, ..."""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from evosax.algorithms.distribution_based import distribution_based_algorithms
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.refiner import (
     Candidate,
     Objective,
@@ -14,17 +15,27 @@ from jaxshape.refine.refiner import (
     Trace,
     finite_or_inf,
     keep_better,
+    start_trace,
     summarise,
 )
 
 
 class State(NamedTuple):
-    """The strategy's own state, and where it lies in the space of codes."""
+    """The strategy's own state, and where it lies in the search space."""
 
-    origin: Float[Array, " d"]  # the first code: zero of the strategy's coordinates
     mean: Float[Array, " d"]
     best: Candidate
+    stop: Int[Array, ""]  # evosax has no criteria: always RUNNING
+    origin: Float[Array, " d"]  # the first point: zero of the strategy's coordinates
+    evaluations: Int[Array, ""]
     strategy_state: Any
+
+
+def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
+    """The strategy that the variant names."""
+    return evosax_strategy(
+        variant or "", dim=dim, population=config.population, sigma0=config.sigma0
+    )
 
 
 def evosax_strategy(
@@ -32,7 +43,7 @@ def evosax_strategy(
 ) -> Refiner:
     """An evosax strategy by name: "Sep_CMA_ES", "SNES", "Open_ES" and their like.
 
-    The strategy searches u in code = first code + sigma0 u from u = 0, so that `sigma0` is the
+    The strategy searches u in point = first + sigma0 u from u = 0, so that `sigma0` is the
     standard deviation of those that start at their default of 1, and the unit of every length and
     learning rate. `settings` go to its constructor, for example `optimizer=optax.adam(0.1)`: some
     defaults (`Open_ES`: 1e-3) hardly move. Losses that are not finite count as the worst finite
@@ -41,21 +52,25 @@ def evosax_strategy(
     strategy = _build(name, dim, population, settings)
     params = strategy.default_params
 
-    def init(key: Array, code: Float[Array, " d"], loss: Float[Array, ""]) -> State:
-        best = Candidate(code, finite_or_inf(loss))
-        return State(code, code, best, strategy.init(key, jnp.zeros_like(code), params))
+    def init(key: Array, point: Float[Array, " d"], loss: Float[Array, ""]) -> tuple[State, Trace]:
+        best = Candidate(point, finite_or_inf(loss))
+        begun = strategy.init(key, jnp.zeros_like(point), params)
+        state = State(point, best, jnp.int32(0), point, jnp.int32(1), begun)
+        return state, start_trace(best)
 
     def step(key: Array, state: State, objective: Objective) -> tuple[State, Trace]:
         ask_key, tell_key = jax.random.split(key)
-        points, strategy_state = strategy.ask(ask_key, state.strategy_state, params)
-        codes = state.origin + sigma0 * points
-        losses = jax.vmap(objective)(codes)
-        strategy_state, _ = strategy.tell(
-            tell_key, points, _worst_if_failed(losses), strategy_state, params
+        units, asked = strategy.ask(ask_key, state.strategy_state, params)
+        points = state.origin + sigma0 * units
+        losses = jax.vmap(objective)(points)
+        told, _ = strategy.tell(tell_key, units, _worst_if_failed(losses), asked, params)
+        state = state._replace(
+            mean=state.origin + sigma0 * strategy.get_mean(told),
+            best=keep_better(state.best, points, losses),
+            evaluations=state.evaluations + population,
+            strategy_state=told,
         )
-        mean = state.origin + sigma0 * strategy.get_mean(strategy_state)
-        best = keep_better(state.best, codes, losses)
-        return State(state.origin, mean, best, strategy_state), summarise(best, codes, losses)
+        return state, summarise(state.best, points, losses, state.evaluations)
 
     return Refiner(init, step)
 

@@ -7,21 +7,22 @@ import optax
 import pytest
 from problems import run_batch, sphere
 
-from jaxshape.refine.strategies import evosax_strategy
+from jaxshape.refine.methods.evosax import evosax_strategy
 
 KEY = jax.random.key(0)
+pytestmark = pytest.mark.usefixtures("compile_quickly")
 SETTINGS = {"Open_ES": {"optimizer": optax.adam(0.1)}}
 
 
 @pytest.mark.parametrize("name", ["Sep_CMA_ES", "SNES", "Open_ES"])
 def test_converges_and_starts_at_sigma0(name):
     refiner = evosax_strategy(name, dim=6, population=20, sigma0=0.3, **SETTINGS.get(name, {}))
-    codes = jnp.linspace(0.5, 1.5, 12).reshape(2, 6)
-    states, traces = jax.jit(lambda: run_batch(refiner, lambda: sphere, KEY, codes, 150))()
-    starts = jax.vmap(sphere)(codes)
+    points = jnp.linspace(0.5, 1.5, 12).reshape(2, 6)
+    states, traces = jax.jit(lambda: run_batch(refiner, lambda: sphere, KEY, points, 150))()
+    starts = jax.vmap(sphere)(points)
     assert np.all(states.best.loss < 0.02 * starts)
     assert np.all(jax.vmap(sphere)(states.mean) < 0.1 * starts)
-    np.testing.assert_allclose(jax.vmap(sphere)(states.best.code), states.best.loss, rtol=1e-5)
+    np.testing.assert_allclose(jax.vmap(sphere)(states.best.point), states.best.loss, rtol=1e-5)
     assert np.all(np.diff(traces.best_loss, axis=1) <= 0)
     np.testing.assert_allclose(traces.spread[:, 0], 0.3, rtol=0.35)
 
@@ -30,14 +31,14 @@ def test_failures_never_reach_the_strategy_and_the_start_counts():
     refiner = evosax_strategy("SNES", dim=3, population=10, sigma0=0.3)
 
     def objective_of(failure):
-        return lambda code: jnp.where(code[0] > 0, failure, sphere(code))
+        return lambda point: jnp.where(point[0] > 0, failure, sphere(point))
 
-    codes = jnp.array([[-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [-1e-9, 0.0, 0.0]])
+    points = jnp.array([[-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [-1e-9, 0.0, 0.0]])
     failures = jnp.array([jnp.nan, jnp.inf, jnp.nan, jnp.nan])
-    states, traces = run_batch(refiner, objective_of, KEY, codes, 60, failures)
+    states, traces = run_batch(refiner, objective_of, KEY, points, 60, failures)
     assert np.all(np.isfinite(states.mean))
     assert np.all(states.best.loss[:2] < 0.1)
-    assert traces.best_loss[3, 0] == sphere(codes[3])  # no candidate beats this start
+    assert traces.best_loss[3, 0] == sphere(points[3])  # no candidate beats this start
 
 
 @pytest.mark.parametrize(

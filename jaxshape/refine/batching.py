@@ -1,0 +1,41 @@
+"""Branches that stay branches under `jax.vmap`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
+
+
+def apply_if(due: Bool[Array, ""], function: Callable[..., Any], *operands: PyTree) -> PyTree:
+    """`function(*operands)` where `due`, else the operands as they are.
+
+    A plain `lax.cond` turns into a select under `jax.vmap` and would do the work for every element
+    every time. Here a batch does it when ANY element is due, and keeps it where that element is.
+    `function` returns what it was given, with the same shapes, and closes over constants only.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def branch(due, *operands):
+        return jax.lax.cond(due, function, lambda *same: same, *operands)
+
+    @branch.def_vmap
+    def branch_if_any(size, batched, due, *operands):
+        due, *operands = jax.tree.map(
+            lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (size, *jnp.shape(x))),
+            [due, *operands],
+            list(batched),
+        )
+
+        def each(due, *old):
+            return due, *jax.vmap(lambda due, *old: _select(due, function(*old), old))(due, *old)
+
+        _, *done = apply_if(jnp.any(due), each, due, *operands)  # which may be batched again
+        return tuple(done), jax.tree.map(lambda _: True, tuple(done))
+
+    return branch(due, *operands)
+
+
+def _select(wanted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, old)

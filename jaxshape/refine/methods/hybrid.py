@@ -1,0 +1,85 @@
+"""CMA-ES first, then descent along the gradient from the best it found: `hybrid`, `hybrid:adam`.
+
+The population finds the basin, the gradient its floor: far from the encoder's guess gradients
+stall, and near a minimum a population of 17 needs hundreds of evaluations for what one gradient
+shows. By default the polish is by L-BFGS.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.methods import build_refiner
+from jaxshape.refine.refiner import Candidate, Objective, Refiner, StopReason, Trace
+
+POLISH = 0.2
+"""Share of the iterations that are left to the gradient."""
+
+
+class State(NamedTuple):
+    """The two searches, of which one is at work."""
+
+    mean: Float[Array, " d"]
+    best: Candidate
+    stop: Int[Array, ""]
+    searched: tuple[Any, Trace]  # of the first search
+    polished: Any  # of the second
+    polishing: Bool[Array, ""]
+    iterations: Int[Array, ""]
+
+
+def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
+    """CMA-ES, polished by the optax optimiser that the variant names."""
+    return polished(
+        build_refiner("cma", dim, config),
+        build_refiner(f"gradient:{variant or 'lbfgs'}", dim, config),
+        round((1 - POLISH) * config.iterations),
+    )
+
+
+def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
+    """`search` until it stops, but at most for `iterations`; then `polish` from its best point."""
+
+    def init(key: Array, point: Float[Array, " d"], loss: Float[Array, ""]) -> tuple[State, Trace]:
+        first, trace = search.init(key, point, loss)
+        second, _ = polish.init(key, point, loss)
+        begun = jnp.bool_(False), jnp.int32(0)
+        return State(first.mean, first.best, first.stop, (first, trace), second, *begun), trace
+
+    def step(key: Array, state: State, objective: Objective) -> tuple[State, Trace]:
+        # A batch has objects in both searches, so both take their step; but the one that rests
+        # asks for points that are not finite, which are not decoded.
+        def only(wanted: Bool[Array, ""]) -> Objective:
+            return lambda point: objective(jnp.where(wanted, point, jnp.nan))
+
+        search_key, polish_key, begin_key = jax.random.split(key, 3)
+        polishing = state.polishing
+        stepped = search.step(search_key, state.searched[0], only(~polishing))
+        searched, trace = _select(polishing, state.searched, stepped)
+        polished, polish_trace = polish.step(polish_key, state.polished, only(polishing))
+        polish_trace = polish_trace._replace(
+            evaluations=trace.evaluations + polish_trace.evaluations - 1,
+            distribution=trace.distribution,
+        )
+        best, mean, shown = _select(
+            polishing,
+            (polished.best, polished.mean, polish_trace),
+            (searched.best, searched.mean, trace),
+        )
+        stop = jnp.where(polishing, polished.stop, jnp.int32(StopReason.RUNNING))
+
+        count = state.iterations + 1
+        begins = ~polishing & ((count >= iterations) | (searched.stop != StopReason.RUNNING))
+        fresh, _ = polish.init(begin_key, best.point, best.loss)
+        polished = _select(begins, fresh, polished)
+        state = State(mean, best, stop, (searched, trace), polished, polishing | begins, count)
+        return state, shown
+
+    return Refiner(init, step)
+
+
+def _select(wanted: Bool[Array, ""], yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), yes, no)

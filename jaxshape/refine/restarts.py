@@ -1,0 +1,188 @@
+"""CMA-ES that starts again with a larger population when it stops: IPOP and BIPOP.
+
+All inside the compiled loop, where shapes are fixed: every iteration evaluates the same number of
+candidates, and a population m times as large collects those of m iterations before the
+distribution moves. Each object of a batch restarts on its own, and no evaluation is wasted.
+
+IPOP doubles the population at each restart (Auger and Hansen, "A restart CMA evolution strategy
+with increasing population size", 2005). BIPOP spends an equal share of the evaluations on short
+runs with small populations and steps (Hansen, "Benchmarking a BI-population CMA-ES on the
+BBOB-2009 function testbed", 2009).
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxshape.refine import cma, stopping
+from jaxshape.refine.batching import apply_if
+from jaxshape.refine.refiner import (
+    Candidate,
+    Objective,
+    Refiner,
+    StopReason,
+    Trace,
+    finite_or_inf,
+    keep_better,
+    summarise,
+)
+from jaxshape.refine.stopping import Tolerances
+
+
+class Run(NamedTuple):
+    """What one run between two restarts is allowed, and has spent."""
+
+    multiple: Int[Array, ""]  # its population, in iterations
+    sigma0: Float[Array, ""]
+    is_small: Bool[Array, ""]  # counts towards the small regime of BIPOP
+    iterations: Int[Array, ""]  # spent
+    allowed: Int[Array, ""]  # iterations
+
+
+class State(NamedTuple):
+    """The run that is under way, the generation it collects, and what came before."""
+
+    mean: Float[Array, " d"]
+    best: Candidate  # of all runs
+    stop: Int[Array, ""]
+    first: Candidate  # where the first run began
+    search: cma.State
+    points: Float[Array, "capacity d"]  # of the generation that is being collected
+    losses: Float[Array, " capacity"]
+    run: Run
+    large_runs: Int[Array, ""]  # restarts with doubled population
+    spent_small: Int[Array, ""]  # iterations of finished runs
+    spent_large: Int[Array, ""]
+    restarts: Int[Array, ""]
+    reason: Int[Array, ""]  # why the last run ended
+
+
+def with_restarts(
+    kind: Literal["ipop", "bipop"],
+    *,
+    dim: int,
+    sigma0: float,
+    population: int | None = None,
+    doublings: int = 5,
+    restart_point: Callable[[Array, Float[Array, " d"]], Float[Array, " d"]] | None = None,
+    tolerances: Tolerances = Tolerances(),
+) -> Refiner:
+    """CMA-ES with restarts; `population` candidates per iteration, whatever the population.
+
+    A run after `doublings` doublings ends the search when it stops. `restart_point(key, first)`
+    draws the mean of a new run; without it, every run begins at the first point.
+    """
+    size = cma.default_population(dim) if population is None else population
+    cma.require_settings(sigma0, size)
+    if doublings < 0:
+        raise ValueError(f"doublings is {doublings}; give 0 or more.")
+    capacity = size * 2**doublings
+    unlimited = jnp.iinfo(jnp.int32).max
+
+    def init(key: Array, point: Float[Array, " d"], loss: Float[Array, ""]) -> tuple[State, Trace]:
+        search, trace = cma.started(cma.start(Candidate(point, loss), sigma0, dim, size))
+        zero = jnp.int32(0)
+        run = Run(
+            multiple=jnp.int32(1),
+            sigma0=search.sigma,
+            is_small=jnp.bool_(True),
+            iterations=zero,
+            allowed=jnp.int32(unlimited),
+        )
+        state = State(
+            mean=search.mean,
+            best=search.best,
+            stop=search.stop,
+            first=search.best,
+            search=search,
+            points=jnp.tile(point, (capacity, 1)),
+            losses=jnp.full(capacity, jnp.inf, point.dtype),
+            run=run,
+            large_runs=zero,
+            spent_small=zero,
+            spent_large=zero,
+            restarts=zero,
+            reason=zero,
+        )
+        return state, trace
+
+    def step(key: Array, state: State, objective: Objective) -> tuple[State, Trace]:
+        ask_key, restart_key = jax.random.split(key)
+        points = cma.ask(ask_key, state.search, size)
+        losses = jax.vmap(objective)(points)
+        state = _collect(state, points, losses, size)
+        run = state.run
+        complete = run.iterations % run.multiple == 0
+        search, *_ = apply_if(complete, move, state.search, state.points, state.losses, run)
+        state = state._replace(search=search, mean=search.mean)
+        over = (search.stop != StopReason.RUNNING) | (run.iterations >= run.allowed)
+        last = over & (state.large_runs >= doublings)
+        again = begin_again(restart_key, state)
+        state = jax.tree.map(lambda new, old: jnp.where(over & ~last, new, old), again, state)
+        state = state._replace(stop=jnp.where(last, search.stop, StopReason.RUNNING))
+        evaluations = 1 + size * (state.spent_small + state.spent_large + state.run.iterations)
+        shape = cma.distribution(state.search)
+        return state, summarise(state.best, points, losses, evaluations, shape)
+
+    def move(search, points, losses, run):
+        """One generation of the whole population."""
+        population = size * run.multiple
+        constants = cma.constants(dim, population, capacity)
+        search = cma.tell(search, points, losses, constants)
+        search = stopping.check(search, losses, run.sigma0, population, tolerances)
+        return search, points, losses, run
+
+    def begin_again(key: Array, state: State) -> State:
+        """The state at the start of the next run."""
+        point_key, size_key, step_key = jax.random.split(key, 3)
+        run = state.run
+        spent_small = state.spent_small + jnp.where(run.is_small, run.iterations, 0)
+        spent_large = state.spent_large + jnp.where(run.is_small, 0, run.iterations)
+        is_small = jnp.bool_(kind == "bipop") & (spent_small < jnp.maximum(1, spent_large))
+        large_runs = state.large_runs + jnp.where(is_small, 0, 1)
+        largest = jnp.left_shift(1, large_runs)
+        # A small population lies between the first one and the largest, mostly near the first.
+        share = jax.random.uniform(size_key) ** 2
+        small = jnp.floor(largest.astype(jnp.float32) ** share).astype(jnp.int32)
+        shrink = 0.01 ** jax.random.uniform(step_key, dtype=run.sigma0.dtype)
+        run = Run(
+            multiple=jnp.where(is_small, small, largest),
+            sigma0=sigma0 * jnp.where(is_small, shrink, 1),
+            is_small=is_small,
+            iterations=jnp.zeros_like(run.iterations),
+            allowed=jnp.where(is_small, spent_large // 2, unlimited),
+        )
+        first = state.first.point
+        point = first if restart_point is None else restart_point(point_key, first)
+        unknown = jnp.full_like(state.best.loss, jnp.inf)
+        return state._replace(
+            search=cma.start(Candidate(point, unknown), run.sigma0, dim, size),
+            losses=jnp.full_like(state.losses, jnp.inf),  # those of a larger population
+            mean=point,
+            run=run,
+            large_runs=large_runs,
+            spent_small=spent_small,
+            spent_large=spent_large,
+            restarts=state.restarts + 1,
+            reason=state.search.stop,
+        )
+
+    return Refiner(init, step)
+
+
+def _collect(
+    state: State, points: Float[Array, "n d"], losses: Float[Array, " n"], size: int
+) -> State:
+    """The state with the candidates of one more iteration in its generation."""
+    run = state.run
+    first = (run.iterations % run.multiple) * size
+    write = jax.lax.dynamic_update_slice_in_dim
+    return state._replace(
+        best=keep_better(state.best, points, losses),
+        points=write(state.points, points, first, axis=0),
+        losses=write(state.losses, finite_or_inf(losses), first, axis=0),
+        run=run._replace(iterations=run.iterations + 1),
+    )

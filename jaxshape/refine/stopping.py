@@ -1,0 +1,218 @@
+"""When a search by CMA-ES is over: the criteria of pycma, per object, inside the compiled loop.
+
+The names are pycma's. Two differences: `tolstagnation` compares windows of a fixed length, where
+pycma's grow with very long runs; and losses closer than their own rounding count as equal, since
+in float32 an absolute `tolfun` of 1e-11 would never be met by losses near 1.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxshape.refine.batching import apply_if
+from jaxshape.refine.refiner import StopReason, finite_or_inf
+
+RECORD_EVERY = 5
+"""Generations between entries of the long history."""
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Thresholds of the criteria; 0 (or infinity for those that are upper limits) turns one off."""
+
+    tolfun: float = 1e-11
+    """Range of the losses of a generation and of the best of recent ones."""
+    tolfunhist: float = 1e-12
+    """Range of the best losses of recent generations."""
+    tolx: float = 1e-11
+    """Standard deviation of every coordinate."""
+    tolxstagnation: float = 1e-9
+    """Distance the mean moves over 20 generations and a tenth of all."""
+    tolstagnation: bool = True
+    """Whether to end after 100 + 100 d^1.5 / population generations without falling medians."""
+    tolfacupx: float = 1e3
+    """Growth of a coordinate's standard deviation over sigma0."""
+    tolupsigma: float = 1e20
+    """Growth of sigma over sigma0 and over the longest axis."""
+    tolconditioncov: float = 1e14
+    """Condition number of the covariance."""
+    tolflatfitness: float = 1.0
+    """Generations in a row of which three quarters of the losses are equal."""
+    noeffect: bool = True
+    """Whether to end where a step no longer changes the mean."""
+
+
+class History(NamedTuple):
+    """What the criteria remember; newest entries first."""
+
+    best_losses: Float[Array, " short"]
+    """Of recent generations; +inf before the first."""
+    recorded: Int[Array, ""]
+    """Entries of the long history, counted even where they no longer fit."""
+    long_best: Float[Array, " long"]
+    long_median: Float[Array, " long"]
+    """Of every fifth generation."""
+    flat: Int[Array, ""]
+    """Generations in a row whose losses were flat."""
+    anchor: Float[Array, " d"]
+    """Where the mean was when it last moved."""
+    anchored: Int[Array, ""]
+    """The generation of that."""
+    lowest: Float[Array, ""]
+    """Best loss of all generations."""
+    improved: Int[Array, ""]
+    """The evaluation in which it was found, counted from 1."""
+    stagnates: Bool[Array, ""]
+    """Whether the long history no longer falls."""
+
+
+def no_history(point: Float[Array, " d"], population: int) -> History:
+    """The history of a search before its first generation."""
+    dim, zero = len(point), jnp.int32(0)
+    short = jnp.full(_recent(dim, population), jnp.inf, point.dtype)
+    long = jnp.full(2 * _window(dim, population), jnp.inf, point.dtype)
+    none = jnp.full((), jnp.inf, point.dtype)
+    return History(short, zero, long, long, zero, point, zero, none, zero, jnp.bool_(False))
+
+
+def _recent(dim: int, population: Any) -> Any:
+    """How many generations pycma's short history holds, 10 + 30 d / population."""
+    return 10 + 30 * dim // population
+
+
+def _stagnation(dim: int, population: Any) -> Any:
+    """pycma's default number of generations without improvement, 100 + 100 d^1.5 / population."""
+    return 100 + math.floor(100 * dim**1.5) // population
+
+
+def _window(dim: int, population: Any) -> Any:
+    """Entries of the long history in each of the two windows that are compared."""
+    return _stagnation(dim, population) // (2 * RECORD_EVERY)
+
+
+def check(
+    state: Any,
+    losses: Float[Array, " capacity"],
+    sigma0: Float[Array, ""] | float,
+    population: int | Int[Array, ""],
+    tolerances: Tolerances,
+) -> Any:
+    """The state after `tell`, with its history and, where a criterion is met, its stop reason.
+
+    `losses` are those of the generation that `tell` has just seen. A traced population may be
+    smaller than their number; those behind it do not count.
+    """
+    counts = jnp.arange(len(losses)) < population
+    losses = jnp.where(counts, finite_or_inf(losses), jnp.inf)
+    ranked = jnp.sort(losses)
+    history = _remember(state, losses, ranked, population, tolerances)
+    met = _criteria(state, history, ranked, sigma0, population, tolerances)
+    reason = jnp.int32(StopReason.RUNNING)
+    for name, is_met in met.items():
+        reason = jnp.where((reason == StopReason.RUNNING) & is_met, jnp.int32(name), reason)
+    return state._replace(history=history, stop=reason)
+
+
+def _remember(
+    state: Any,
+    losses: Float[Array, " capacity"],
+    ranked: Float[Array, " capacity"],
+    population: int | Int[Array, ""],
+    tolerances: Tolerances,
+) -> History:
+    """The history with this generation in it."""
+    old, now = state.history, state.generation
+    best, window = ranked[0], _window(len(state.mean), population)
+    median = (ranked[(population - 1) // 2] + ranked[population // 2]) / 2
+    record = now % RECORD_EVERY == 0
+    # The longer the mean has stood still, the further it must go to count as moving.
+    age = (now - old.anchored) / _patience(now)
+    reach = tolerances.tolxstagnation * jnp.sqrt(jnp.maximum(1, age))
+    moved = jnp.linalg.norm(state.mean - old.anchor) > reach
+    recorded = old.recorded + record
+    winner = (now - 1) * population + jnp.argmin(losses) + 1
+    history = History(
+        best_losses=_push(old.best_losses, best),
+        recorded=recorded,
+        long_best=jnp.where(record, _push(old.long_best, best), old.long_best),
+        long_median=jnp.where(record, _push(old.long_median, median), old.long_median),
+        flat=jnp.where(best < ranked[3 * population // 4], 0, old.flat + 1),
+        anchor=jnp.where(moved, state.mean, old.anchor),
+        anchored=jnp.where(moved, now, old.anchored),
+        lowest=jnp.minimum(best, old.lowest),
+        improved=jnp.where(best < old.lowest, winner.astype(jnp.int32), old.improved),
+        stagnates=old.stagnates,
+    )
+    due = record & (recorded > jnp.maximum(2 * window, 100))
+    return apply_if(due, _compare_windows, history, jnp.int32(window))[0]
+
+
+def _push(values: Float[Array, " n"], newest: Float[Array, ""]) -> Float[Array, " n"]:
+    return jnp.concatenate([newest[None], values[:-1]])
+
+
+def _patience(generation: Int[Array, ""]) -> Float[Array, ""]:
+    """Generations that the mean may stand still."""
+    return 20 + 0.1 * generation
+
+
+def _criteria(
+    state: Any,
+    history: History,
+    ranked: Float[Array, " capacity"],
+    sigma0: Float[Array, ""] | float,
+    population: int | Int[Array, ""],
+    tolerances: Tolerances,
+) -> dict[StopReason, Bool[Array, ""]]:
+    """Which criteria are met; where several are, the first one names the reason."""
+    t, mean, dim, now = tolerances, state.mean, len(state.mean), state.generation
+    deviations = state.sigma * jnp.sqrt(jnp.diag(state.covariance))
+
+    rounding = jnp.finfo(mean.dtype).eps * jnp.abs(ranked[0])
+    generation_range = ranked[population - 1] - ranked[0]
+    recent = jnp.arange(len(history.best_losses)) < jnp.minimum(now, _recent(dim, population))
+    losses = history.best_losses
+    recent_range = jnp.max(losses, where=recent, initial=-jnp.inf) - jnp.min(
+        losses, where=recent, initial=jnp.inf
+    )
+
+    def within(spread, tolerance):
+        return (spread < jnp.maximum(tolerance, rounding)) if tolerance else jnp.bool_(False)
+
+    stagnates = history.stagnates & (now > dim * (5 + 100 / population))
+    since = (now * population - history.improved) / population
+    stagnates &= since > _stagnation(dim, population) / 2
+
+    axis = now % dim
+    axis_step = 0.1 * state.sigma * state.scales[axis] * state.basis[:, axis]
+    no_effect = jnp.any(mean == mean + 0.2 * deviations) | jnp.all(mean == mean + axis_step)
+    return {
+        StopReason.TOLFUN: within(generation_range, t.tolfun) & within(recent_range, t.tolfun),
+        StopReason.TOLFUNHIST: (now > 9) & within(recent_range, t.tolfunhist),
+        StopReason.TOLX: jnp.all(deviations < t.tolx)
+        & jnp.all(state.sigma * state.path_c < t.tolx),
+        StopReason.TOLXSTAGNATION: (now - history.anchored > _patience(now))
+        & bool(t.tolxstagnation),
+        StopReason.TOLSTAGNATION: stagnates & t.tolstagnation,
+        StopReason.TOLFACUPX: jnp.any(deviations > t.tolfacupx * sigma0),
+        StopReason.TOLUPSIGMA: state.sigma > t.tolupsigma * sigma0 * state.scales[-1],
+        StopReason.TOLCONDITIONCOV: state.scales[-1] > t.tolconditioncov**0.5 * state.scales[0],
+        StopReason.TOLFLATFITNESS: history.flat > t.tolflatfitness,
+        StopReason.NOEFFECT: no_effect & t.noeffect,
+    }
+
+
+def _compare_windows(history: History, window: Int[Array, ""]) -> tuple[History, Int[Array, ""]]:
+    """Whether neither best nor median losses are lower in the newer of two windows."""
+    place = jnp.arange(len(history.long_best))
+
+    def median(values, first):
+        inside = (place >= first) & (place < first + window)
+        ranked = jnp.sort(jnp.where(inside, values, jnp.inf))
+        return (ranked[(window - 1) // 2] + ranked[window // 2]) / 2
+
+    both = [median(x, 0) >= median(x, window) for x in (history.long_best, history.long_median)]
+    return history._replace(stagnates=both[0] & both[1]), window
