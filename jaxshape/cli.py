@@ -6,11 +6,13 @@ it was. JAX, and all that needs it, is imported inside `run`, so that `--help` a
 """
 
 import json
+import math
 import os
+import pkgutil
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,50 +24,78 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from tyro.conf import Positional, subcommand
 
-from jaxshape.refine.config import METHODS, Method, RefineConfig
+from jaxshape.process import prepare_process
+from jaxshape.refine.config import RefineConfig
 
 console = Console(stderr=True)
 """Progress, warnings and errors; what a command answers goes to standard output."""
+
+# Found as files: importing the package of the methods would import JAX.
+METHODS = ", ".join(
+    family.name for family in pkgutil.iter_modules([str(Path(__file__).parent / "refine/methods")])
+)
+VARIANTS = "cma:ipop, cma:bipop, gradient:OPTIMISER of optax, evosax:STRATEGY, hybrid:OPTIMISER"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rebuild:
     """What the commands that rebuild one object have in common."""
 
-    method: Method = "cma"
-    """How the first code is searched on: not at all, by gradient descent, by CMA-ES."""
+    method: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar="METHOD",
+            help=f"How the first code is searched on: encoder (not at all), {METHODS}, or a "
+            f"variant: {VARIANTS}.",
+        ),
+    ] = "cma"
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
     seed: int = 0
     """Of all random numbers."""
 
+    def prepare(self) -> tuple[Any, Callable[..., Any]]:
+        """The shape prior and the search, so that bad options are refused before any work."""
+        from jaxshape.model.weights import load_prior
+        from jaxshape.refine.reconstruction import reconstruct_jit, refiner_for
+
+        config, prior = _checked(self.search), load_prior(self.weights)
+        return prior, reconstruct_jit(refiner_for(self.method, prior, config), config)
+
     def rebuild(
-        self, observation: Any, figures: dict[str, Any], output: Path, start: float
+        self,
+        prepared: tuple[Any, Callable[..., Any]],
+        observation: Any,
+        figures: dict[str, Any],
+        output: Path,
+        start: float,
     ) -> dict[str, Any]:
         """Encode, search, and write the files of one observed object; returns result.json."""
         import jax
         import jax.numpy as jnp
 
-        from jaxshape.model.weights import load_prior
-        from jaxshape.refine.reconstruction import reconstruct_jit, refiner_for, require_measured
+        from jaxshape.refine.reconstruction import require_measured
         from jaxshape.results.output import write_result
 
         require_measured(observation.occupied)
-        prior, config = load_prior(self.weights), _checked(self.search)
+        prior, run = prepared
         with console.status("searching the space of shapes"):
             grids = jnp.asarray(observation.occupied)[None], jnp.asarray(observation.occluded)[None]
-            run = reconstruct_jit(refiner_for(self.method, prior, config), config)
             keys = jax.random.key(self.seed)[None]
             reconstruction = jax.block_until_ready(run(keys, prior, *grids))
-            settings = {"method": self.method, "seed": self.seed, **vars(self.search)}
-            figures = {**figures, **settings, "seconds": round(time.perf_counter() - start, 2)}
+        figures |= {"method": self.method, "seed": self.seed, "search": asdict(self.search)}
+        figures["seconds"] = round(time.perf_counter() - start, 2)
+        with console.status("drawing"):
             result = write_result(output, observation, reconstruction, figures)
+        stopped = f", stopped by {result['stop']}" if result["stop"] else ""
         print(
             f"objective: encoder {result['objective_encoder']:.4f}, "
-            f"refined {result['objective_refined']:.4f} nats per voxel"
+            f"refined {result['objective_refined']:.4f} nats per voxel "
+            f"after {result['iterations']} iterations{stopped}"
         )
-        print(f"wrote mesh.glb, grid.npz, overview.png, result.json to {output}")
+        trace = "trace.npz, " if result["stop"] else ""
+        print(f"wrote mesh.glb, grid.npz, {trace}overview.png, result.json to {output}")
         return result
 
 
@@ -74,10 +104,11 @@ class Demo(Rebuild):
     frames: int = 6
     """Depth frames along the orbit, 20 degrees apart."""
     output: Path = Path("out/demo")
-    """Folder for mesh.glb, grid.npz, result.json and overview.png."""
+    """Folder for mesh.glb, grid.npz, trace.npz, result.json and overview.png."""
 
     def run(self) -> None:
         start = time.perf_counter()
+        import jax
         import numpy as np
 
         from jaxshape.data.capture import capture, measure_frames
@@ -88,11 +119,12 @@ class Demo(Rebuild):
 
         _require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
         _require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
+        prepared = self.prepare()
         mesh = random_chair(TEST_SEEDS + self.seed)
         # As near as a Kinect's 57 degrees allow: what it measures gets worse with distance squared.
-        T_object_camera = camera.orbit(self.frames, radius=float(mesh.scale))
+        T_object_camera = jax.jit(lambda: camera.orbit(self.frames, float(mesh.scale)))()
         seen = capture(mesh, T_object_camera, noise=True, seed=self.seed)
-        merged = fusion.merge_all(measure_frames(seen))
+        merged = jax.jit(fusion.merge_all)(measure_frames(seen))
         observation = Observation(
             depth=list(np.asarray(seen.depth)[:6]),
             occupied=np.asarray(fusion.occupied(merged)),
@@ -102,7 +134,7 @@ class Demo(Rebuild):
             truth=np.asarray(seen.surface),
         )
         figures = {"object": f"procedural chair {TEST_SEEDS + self.seed}", "frames": self.frames}
-        result = self.rebuild(observation, figures, self.output, start)
+        result = self.rebuild(prepared, observation, figures, self.output, start)
         print(
             f"IoU with the true surface: encoder {result['iou_encoder']:.3f}, "
             f"refined {result['iou_refined']:.3f}, composed {result['iou_composed']:.3f}"
@@ -242,7 +274,7 @@ class Reconstruct(Rebuild):
     isotropic: bool = False
     """Scale all axes alike, as the paper does on real data, instead of filling the box."""
     output: Path = Path("out/reconstruct")
-    """Folder for mesh.glb, grid.npz, result.json and overview.png."""
+    """Folder for mesh.glb, grid.npz, trace.npz, result.json and overview.png."""
 
     def run(self) -> None:
         start = time.perf_counter()
@@ -253,6 +285,7 @@ class Reconstruct(Rebuild):
 
         _require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
         _require(self.min_hits >= 1, f"--min-hits is {self.min_hits}; give 1 or more.")
+        prepared = self.prepare()
         sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
         box = read_box(self.box) if self.box else None
         _require(
@@ -267,7 +300,7 @@ class Reconstruct(Rebuild):
                 sequence, watched, box, min_hits=self.min_hits, isotropic=self.isotropic
             )
         figures = {"object": str(self.frames), "frames": len(chosen)}
-        self.rebuild(observation, figures, self.output, start)
+        self.rebuild(prepared, observation, figures, self.output, start)
 
 
 @dataclass(frozen=True)
@@ -281,7 +314,7 @@ class Evaluate:
     frames: str = "1,4,8,18"
     """Numbers of frames to fuse, with commas: the first k of an orbit in steps of 20 degrees."""
     methods: str = "encoder,gradient,cma"
-    """Methods to score, with commas."""
+    """Methods to score, with commas; those of `jaxshape reconstruct --method`."""
     up: str = "y"
     """Axis of the meshes that points up: x, y, z, -x, -y or -z."""
     front: str = "z"
@@ -304,12 +337,9 @@ class Evaluate:
         from jaxshape.results import evaluation
 
         frames = _numbers(self.frames, "--frames")
-        methods: Any = tuple(self.methods.split(","))
-        for method in methods:
-            _require(
-                method in METHODS,
-                f"--methods names {method!r}; choose from {', '.join(METHODS)}, with commas.",
-            )
+        config = evaluation.EvaluateConfig(
+            frames, tuple(self.methods.split(",")), self.noise, _checked(self.search), self.seed
+        )
         axes_to_canonical(self.up, self.front)
         _require(
             (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
@@ -318,11 +348,11 @@ class Evaluate:
         test_seeds = range(TEST_SEEDS, TEST_SEEDS + self.chairs)
         sources = list_meshes(self.meshes) if self.meshes else test_seeds
         prior = load_prior(self.weights)
-        config = evaluation.EvaluateConfig(
-            frames, methods, self.noise, _checked(self.search), self.seed
-        )
+        evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
         models, skipped = _load_models(sources, self.up, self.front)
-        settings = json.dumps(vars(self), default=str, sort_keys=True)
+        settings = json.dumps(
+            vars(self) | {"weights": evaluation.fingerprint(prior)}, default=str, sort_keys=True
+        )
         per_mesh = evaluation.read_journal(self.output, settings)
         scored = {scores["name"] for scores in per_mesh}
         left = [model for model in models if model.name not in scored]
@@ -353,6 +383,27 @@ class Evaluate:
             path.write_text(json.dumps(content, indent=1))
         evaluation.remove_journal(self.output)
         Console().print(_table(means, len(per_mesh)))
+
+
+@dataclass(frozen=True)
+class Plot:
+    results: Positional[tuple[Path, ...]]
+    """Folders made by `jaxshape reconstruct` or `jaxshape demo`; several are compared."""
+    output: Path | None = None
+    """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder where not given."""
+
+    def run(self) -> None:
+        from jaxshape.results.plots import compare_searches, plot_search
+        from jaxshape.results.traces import read_search
+
+        _require(bool(self.results), "Give one result folder or more.")
+        searches = [read_search(folder) for folder in self.results]
+        output = self.output or self.results[0] / "trace.png"
+        if len(searches) == 1:
+            plot_search(output, searches[0])
+        else:
+            compare_searches(output, searches)
+        print(f"wrote {output}")
 
 
 # ------------------------------------------------------------------ shared by the commands
@@ -386,8 +437,20 @@ def _load_models(sources, up: str, front: str):
 
 
 def _checked(search: RefineConfig) -> RefineConfig:
-    _require(search.iterations >= 1, f"--iterations is {search.iterations}; give 1 or more.")
-    _require(search.population >= 3, f"--population is {search.population}; give 3 or more.")
+    """The options of a search, once each is in its range."""
+    inf = math.inf
+    for name, is_fine, wanted in (
+        ("iterations", search.iterations >= 1, "1 or more"),
+        ("population", search.population >= 3, "3 or more"),
+        ("sigma0", 0 < search.sigma0 < inf, "a number above 0"),
+        ("step_size", search.step_size is None or 0 < search.step_size < inf, "a number above 0"),
+        ("bound", search.bound is None or 0 < search.bound < inf, "a number above 0"),
+        ("prior_weight", 0 <= search.prior_weight < inf, "0 or more"),
+        ("tolerance", 0 <= search.tolerance < inf, "0 or more"),
+        ("target", search.target is None or not math.isnan(search.target), "a number"),
+    ):
+        option, given = name.replace("_", "-"), getattr(search, name)
+        _require(is_fine, f"--{option} is {given}; give {wanted}.")
     return search
 
 
@@ -487,6 +550,15 @@ _Command = (
             "--methods encoder,gradient,cma --output scores.json",
         ),
     ]
+    | Annotated[
+        Plot,
+        subcommand(
+            "plot",
+            description="Plot the search behind a result, or compare several.\n\n"
+            "Examples: jaxshape plot out/demo\n\n"
+            "jaxshape plot out/cma out/hybrid --output compare.svg",
+        ),
+    ]
 )
 
 
@@ -494,6 +566,7 @@ def main() -> None:
     """Run the command line; the entry point of the console script."""
     warnings.showwarning = lambda message, *_, **__: console.print(f"[yellow]warning[/] {message}")
     command = tyro.cli(_Command, prog="jaxshape")  # pyright: ignore[reportArgumentType]
+    prepare_process()
     try:
         command.run()
     except (ValueError, OSError) as problem:

@@ -17,13 +17,18 @@ from jaxshape import cli
 from jaxshape.data.chairs import random_chair
 from jaxshape.model import weights
 from jaxshape.model.weights import save_prior
+from jaxshape.refine.methods import families
+from jaxshape.results import evaluation
+from jaxshape.results.plots import plot_search
+from jaxshape.results.traces import read_search
 
-COMMANDS = ("demo", "dataset", "train", "reconstruct", "evaluate")
+COMMANDS = ("demo", "dataset", "train", "reconstruct", "evaluate", "plot")
 
 
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Run a command in this process; returns its exit status, its answer and its complaint."""
+    monkeypatch.setattr(cli, "keep_compiled", lambda: None)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["jaxshape", *map(str, arguments)])
@@ -62,6 +67,7 @@ assert "jax" not in sys.modules, "jax was imported"
     for command in COMMANDS:
         text = answer.stdout.split(f"end of {command}")[0].rsplit("end of", 1)[-1]
         assert re.search(rf"Examples?:\s.*jaxshape {command}", text, re.DOTALL), command
+    assert all(f" {family}," in answer.stdout for family in ("encoder", *families()))
 
 
 # --- bad input --------------------------------------------------------------------------------
@@ -143,12 +149,12 @@ def move_the_box(folder):
         (lambda folder: (folder / "camera-intrinsics.txt").unlink(), "is missing"),
     ],
 )
-def test_a_damaged_scan_is_refused(frames, refused, damage, said):
+def test_a_damaged_scan_is_refused(frames, refused, damage, said, linear_weights):
     damage(frames)
     assert said in refused("reconstruct", frames, "--box", frames / "box.json")
 
 
-def test_a_missing_folder_or_box_is_refused(frames, refused, tmp_path):
+def test_a_missing_folder_or_box_is_refused(frames, refused, tmp_path, linear_weights):
     assert "is not a folder" in refused("reconstruct", tmp_path / "nowhere")
     assert "give its box with --box" in refused("reconstruct", frames)
     assert "cannot be read" in refused("reconstruct", frames, "--box", tmp_path / "nowhere.json")
@@ -166,8 +172,6 @@ def chair(tmp_path_factory):
     [
         (("--every", "0"), "--every is 0"),
         (("--min-hits", "0"), "--min-hits is 0"),
-        (("--iterations", "0"), "--iterations is 0"),
-        (("--population", "2"), "--population is 2"),
         (("--depth-scale", "0"), "The depth scale is 0"),
     ],
 )
@@ -180,10 +184,37 @@ def test_options_of_a_scan_out_of_range_are_refused(scene, refused, tmp_path, op
 @pytest.mark.parametrize(
     "options, said",
     [
+        (("--iterations", "0"), "--iterations is 0"),
+        (("--population", "2"), "--population is 2"),
+        (("--sigma0", "0"), "--sigma0 is 0"),
+        (("--sigma0", "nan"), "--sigma0 is nan"),
+        (("--step-size", "-1"), "--step-size is -1"),
+        (("--bound", "0"), "--bound is 0"),
+        (("--prior-weight", "inf"), "--prior-weight is inf"),
+        (("--tolerance", "-1"), "--tolerance is -1"),
+        (("--target", "nan"), "--target is nan"),
+        (("--method", "magic"), "no method 'magic'"),
+        (("--method", "cma:magic"), "no method 'cma:magic'"),
+        (("--method", "gradient:magic"), "no optimiser 'magic'"),
+        (("--method", "evosax:magic"), "no evosax strategy 'magic'"),
+        (("--weights", "nowhere.safetensors"), "There is no weights file"),
+    ],
+)
+def test_a_search_that_cannot_be_is_refused_before_frames_are_read(
+    refused, tmp_path, options, said, monkeypatch, linear_prior
+):
+    if "--weights" not in options:
+        monkeypatch.setattr(weights, "load_prior", lambda path=None: linear_prior)
+    assert said in refused("reconstruct", tmp_path / "no such frames", *options)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
         (("--frames", "1,x"), "--frames is '1,x'"),
         (("--frames", "0"), "--frames is '0'"),
         (("--frames", "2,2"), "--frames is '2,2'"),
-        (("--methods", "encoder,magic"), "--methods names 'magic'"),
+        (("--methods", "encoder,magic"), "no method 'magic'"),
         (("--up", "q"), "up must be one of"),
         (("--up", "z"), "must be perpendicular"),
     ],
@@ -232,7 +263,7 @@ def test_a_missing_dataset_is_refused(refused, tmp_path):
 
 # --- what works -------------------------------------------------------------------------------
 
-RESULTS = {"mesh.glb", "grid.npz", "overview.png", "result.json"}
+RESULTS = {"mesh.glb", "grid.npz", "trace.npz", "overview.png", "result.json"}
 
 
 @pytest.fixture
@@ -247,9 +278,24 @@ def test_reconstruct_writes_its_files(run, scene, tmp_path, linear_weights):
     assert status == 0, err
     assert {path.name for path in tmp_path.iterdir()} == RESULTS
     result = json.loads((tmp_path / "result.json").read_text())
-    assert result["frames"] == 2 and result["iterations"] == 2 and result["seconds"] > 0
+    assert result["frames"] == 2 and result["seconds"] > 0
+    assert (result["iterations"], result["evaluations"]) == (2, 35)
+    assert result["stop"] == "budget" and result["search"]["iterations"] == 2
     assert result["objective_refined"] <= result["objective_encoder"]
     assert "objective:" in out and str(tmp_path) in out
+
+    status, out, err = run("plot", tmp_path)
+    assert status == 0 and str(tmp_path / "trace.png") in out, err
+    plot_search(tmp_path / "again.png", read_search(tmp_path))
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "trace.png").read_bytes()
+    status, out, err = run("plot", tmp_path, tmp_path, "--output", tmp_path / "compare.svg")
+    assert status == 0 and (tmp_path / "compare.svg").exists(), err
+
+
+def test_plots_of_other_folders_are_refused(run, tmp_path):
+    for arguments, said in (((tmp_path,), "is not a result folder"), ((), "one result folder")):
+        status, out, err = run("plot", *arguments)
+        assert status == 2 and said in err and not out
 
 
 def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear_weights):
@@ -278,6 +324,32 @@ def test_evaluate_writes_scores_of_each_mesh_and_their_means(run, chair, tmp_pat
     assert set(content["means"]["1"]) == {"encoder", "gradient", "bounds"}
     assert content["per_mesh"][0]["frames"] == content["means"]
     assert "encoder" in out and "gradient" in out
+
+
+def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
+    run, chair, tmp_path, monkeypatch, linear_prior
+):
+    asked, current = [], [linear_prior]
+    monkeypatch.setattr(weights, "load_prior", lambda path=None: current[0])
+
+    def evaluate(prior, models, config):
+        asked.append(len(models))
+        for model in models:
+            scores = {"1": {"encoder": {"iou": 1.0}, "bounds": {"occluded_empty": 1.0}}}
+            yield {"name": model.name, "metadata": {}, "frames": scores}
+            if len(asked) < 3:
+                raise OSError("killed.")
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    (tmp_path / "meshes").mkdir()
+    for name in ("a.ply", "b.ply", "c.ply"):
+        (tmp_path / "meshes" / name).write_bytes(chair.read_bytes())
+    arguments = ("--meshes", tmp_path / "meshes", "--frames", 1, "--methods", "encoder")
+    for status in (2, 2, 0):
+        assert run("evaluate", *arguments, "--output", tmp_path / "scores.json")[0] == status
+        if len(asked) == 1:
+            current[0] = linear_prior._replace(code_mean=linear_prior.code_mean + 1)
+    assert asked == [3, 3, 2]
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """Score refinement methods on meshes seen along an orbit (paper, section 4.1). [host]"""
 
+import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,11 +18,11 @@ from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
 from jaxshape.model.weights import ShapePrior
+from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import (
-    Method,
-    RefineConfig,
+    Reconstruction,
     all_measured,
-    reconstruct_jit,
+    reconstruct,
     refiner_for,
 )
 from jaxshape.results.metrics import bounds, iou, shape_scores
@@ -36,7 +37,8 @@ class EvaluateConfig:
 
     frames: tuple[int, ...] = (1, 4, 8, 18)
     """Numbers of frames to fuse: the first k of the orbit."""
-    methods: tuple[Method, ...] = ("encoder", "gradient", "cma")
+    methods: tuple[str, ...] = ("encoder", "gradient", "cma")
+    """By name, see `jaxshape.refine.methods`; "encoder" searches nothing."""
     noise: bool = False
     """Add the faults of a real sensor to the depth images."""
     refine: RefineConfig = field(default_factory=RefineConfig)
@@ -83,10 +85,7 @@ def evaluate(
     Meshes are refined in batches; the last batch is filled up with its own first cases so that
     one compiled program serves all.
     """
-    run = {
-        method: reconstruct_jit(refiner_for(method, prior, config.refine), config.refine)
-        for method in config.methods
-    }
+    run = by_each_method(prior, config)
     group = max(1, OBJECTS_AT_A_TIME // len(config.frames))
     size = min(group, len(models)) * len(config.frames)
     for start in range(0, len(models), group):
@@ -98,10 +97,8 @@ def evaluate(
         keys = jnp.stack([key for model, _ in seen for key in _keys(model, config)])
         cases = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in seen])
         keys, filled = jax.tree.map(lambda x: _fill(x, size), (keys, cases))
-        found = {
-            method: jax.device_get(run[method](keys, prior, filled.occupied, filled.occluded))
-            for method in config.methods
-        }
+        found = jax.device_get(run(keys, prior, filled.occupied, filled.occluded))
+        found = {name: found[name] for name in config.methods}  # JAX has sorted the names
         cases = jax.device_get(cases)
         for i, (model, _) in enumerate(seen):
             rows = range(i * len(config.frames), (i + 1) * len(config.frames))
@@ -110,6 +107,26 @@ def evaluate(
                 for k, row in zip(config.frames, rows, strict=True)
             }
             yield {"name": model.name, "metadata": model.metadata, "frames": frames}
+
+
+def by_each_method(
+    prior: ShapePrior, config: EvaluateConfig
+) -> Callable[..., dict[str, Reconstruction]]:
+    """A compiled `reconstruct` by every method; ValueError for a name that is none.
+
+    In one program, where XLA computes only once what the methods have in common: the first code,
+    its decoded shape and the target.
+    """
+    refiners = {name: refiner_for(name, prior, config.refine) for name in config.methods}
+
+    @jax.jit
+    def run(keys, prior, occupied, occluded):
+        return {
+            name: reconstruct(keys, prior, occupied, occluded, refiner, config.refine)
+            for name, refiner in refiners.items()
+        }
+
+    return run
 
 
 def _keys(model: Model, config: EvaluateConfig) -> list[PRNGKeyArray]:
@@ -150,6 +167,15 @@ def summarize(per_mesh: Sequence[dict[str, Any]], config: EvaluateConfig) -> dic
         }
         for k in config.frames
     }
+
+
+def fingerprint(prior: ShapePrior) -> str:
+    """A hash of all numbers of a shape prior: the same for the same weights, wherever they lie."""
+    digest = hashlib.sha256()
+    for path, x in jax.tree_util.tree_leaves_with_path(prior):
+        digest.update(jax.tree_util.keystr(path).encode())
+        digest.update(np.asarray(x).tobytes())
+    return digest.hexdigest()
 
 
 # A long evaluation keeps its scores in a journal beside the results file until that is written.

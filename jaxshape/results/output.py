@@ -1,4 +1,4 @@
-"""The files of one reconstruction: mesh, grids, figures and a picture. [host]"""
+"""The files of one reconstruction: mesh, grids, trace, figures and a picture. [host]"""
 
 import json
 import os
@@ -14,9 +14,11 @@ from jaxtyping import Array, Bool, Float
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.refine.reconstruction import Reconstruction
+from jaxshape.refine.refiner import StopReason
 from jaxshape.results.metrics import iou
 from jaxshape.results.pictures import grid_panel, measurement_panel, mesh_panel, overview
 from jaxshape.results.surface import surface, write_mesh
+from jaxshape.results.traces import write_trace
 
 SMOOTHING = 20
 """Rounds of Taubin's filter that take the staircase off a boolean grid."""
@@ -41,13 +43,16 @@ def write_result(
     reconstruction: Reconstruction,
     figures: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write `mesh.glb`, `grid.npz`, `overview.png` and, last, `result.json` of ONE object.
+    """Write `mesh.glb`, `grid.npz`, `trace.npz`, `overview.png` and, last, `result.json` of ONE
+    object.
 
-    The mesh is the composed shape in the world frame, in metres. `result.json` holds `figures`,
-    the objective before and after, and the IoUs where the truth is known; it is returned.
+    The mesh is the composed shape in the world frame, in metres. The trace has a row for each
+    iteration of the search; there is none of the encoder alone. `result.json` holds `figures`, the
+    objective before and after, what the search took and why it stopped, and the IoUs where the
+    truth is known; it is returned.
     """
     folder, one = Path(folder), jax.device_get(jax.tree.map(lambda x: x[0], reconstruction))
-    result = {**figures, **_measured(observation, one)}
+    result = {**figures, **_searched(one), **_measured(observation, one)}
     mesh = surface(
         one.composed,
         observation.frame,
@@ -56,10 +61,24 @@ def write_result(
     )
     write_mesh(mesh, folder / "mesh.glb")
     _write_grids(folder / "grid.npz", observation, one)
+    if one.trace is None:
+        (folder / "trace.npz").unlink(missing_ok=True)  # of an earlier search
+    else:
+        write_trace(folder / "trace.npz", jax.tree.map(lambda x: x[: one.iterations], one.trace))
     _draw(folder / "overview.png", observation, one, result)
     with atomic_path(folder / "result.json") as path:
         path.write_text(json.dumps(result, indent=2))
     return result
+
+
+def _searched(one: Any) -> dict[str, Any]:
+    if one.trace is None:
+        return {"iterations": 0, "evaluations": 1, "stop": None}
+    return {
+        "iterations": int(one.iterations),
+        "evaluations": int(one.trace.evaluations[-1]),
+        "stop": StopReason(int(one.stop)).name.lower(),
+    }
 
 
 def _measured(observation: Observation, one: Any) -> dict[str, Any]:

@@ -4,7 +4,7 @@ Objects are drawn orthographically with +y up. `azimuth` is 0 in front of the ob
 towards its +x side, as for the cameras; `elevation` grows upwards; both are in degrees.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +23,6 @@ COLORS = {
     "truth": "#009E73",
     "occluded": "#B4BBC2",
 }
-
-_LINES = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"]
 
 _SUPERSAMPLING = 2  # pixels averaged along each axis, to smooth edges
 _MARGIN = 1.02  # room around the object, as a factor of its extent
@@ -327,32 +325,3 @@ def _draw_row(figure: Any, row: Sequence[Panel], top: float, height: float) -> N
         figure.text(middle, 1 - top - line / 2, panel.title, fontsize=16, weight="bold", **style)
         figure.text(middle, 1 - top - 1.5 * line - height, panel.note, fontsize=15, **style)
         left += width + gap
-
-
-def convergence(
-    path: str | Path, traces: Mapping[str, Float[np.ndarray, "_ _"]], *, label: str = "objective"
-) -> None:
-    """Plot the mean of objective by iteration, and the middle 80 % of the objects as a band.
-
-    Each trace is indexed by object and iteration; there may be one per refiner, and none need be
-    as long as another.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), dpi=100, layout="constrained")
-    axes = figure.add_subplot()
-    for (name, trace), color in zip(traces.items(), _LINES * len(traces), strict=False):
-        iteration = np.arange(trace.shape[1])
-        low, high = np.percentile(trace, (10, 90), axis=0)
-        axes.fill_between(iteration, low, high, color=color, alpha=0.15, linewidth=0)
-        axes.plot(iteration, trace.mean(axis=0), color=color, linewidth=2.2, label=name)
-    axes.set_xlabel("iteration", fontsize=14)
-    axes.set_ylabel(label, fontsize=14)
-    axes.tick_params(labelsize=12, colors=_INK)
-    axes.grid(color="#E3E6E8", linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.margins(x=0)
-    if len(traces) > 1:
-        axes.legend(frameon=False, fontsize=13)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary)

@@ -14,7 +14,9 @@ from jaxshape.refine.config import RefineConfig
 from jaxshape.results import evaluation
 from jaxshape.results.evaluation import (
     EvaluateConfig,
+    by_each_method,
     evaluate,
+    fingerprint,
     observe,
     read_journal,
     remove_journal,
@@ -124,6 +126,31 @@ def test_a_mesh_no_pixel_meets_is_skipped_with_a_reason(linear_prior, models):
     config = replace(CONFIG, frames=(1,), methods=("encoder",))
     speck, chair = evaluate(linear_prior, [Model("speck", speck, {}), models[0]], config)
     assert speck.reason == "nothing measured" and chair["name"] == "chair-0"
+
+
+def test_what_methods_have_in_common_is_computed_once(linear_prior):
+    """The encoder's answer costs nothing beside a search from it."""
+
+    def flops(*methods):
+        run = by_each_method(linear_prior, replace(CONFIG, methods=methods))
+        grid = jax.ShapeDtypeStruct((2, 32, 32, 32), bool)
+        keys = jax.random.split(jax.random.key(0), 2)
+        return run.lower(keys, linear_prior, grid, grid).compile().cost_analysis()["flops"]
+
+    both, search, encoder = flops("encoder", "gradient"), flops("gradient"), flops("encoder")
+    assert both - search < 0.1 * encoder
+
+
+def test_an_unknown_method_is_refused_before_anything_is_compiled(linear_prior):
+    with pytest.raises(ValueError, match="no method 'magic'"):
+        by_each_method(linear_prior, replace(CONFIG, methods=("encoder", "magic")))
+
+
+def test_weights_are_known_by_their_numbers(linear_prior):
+    copy = jax.tree.map(lambda x: x + 0, linear_prior)
+    assert fingerprint(copy) == fingerprint(linear_prior)
+    changed = linear_prior._replace(code_mean=linear_prior.code_mean.at[3].set(1e-6))
+    assert fingerprint(changed) != fingerprint(linear_prior)
 
 
 def test_a_journal_gives_back_what_was_scored_under_the_same_settings_only(tmp_path, scores):

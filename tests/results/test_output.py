@@ -10,9 +10,11 @@ from PIL import Image
 
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.refine.reconstruction import Reconstruction, compose
+from jaxshape.refine.refiner import StopReason, Trace
 from jaxshape.results import output
 from jaxshape.results.metrics import iou
 from jaxshape.results.output import Observation, write_result
+from jaxshape.results.traces import read_trace
 
 T_WORLD_OBJECT = np.array([[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]], float)
 
@@ -43,7 +45,10 @@ RECONSTRUCTION = Reconstruction(
     composed=compose(jnp.asarray(OCCUPIED), jnp.asarray(OCCLUDED), jnp.asarray(COMPLETED))[None],
     first_objective=jnp.array([0.5]),
     objective=jnp.array([0.25]),
-    trace=None,
+    # Stopped after three of five iterations, and constant from then on.
+    trace=Trace(*(jnp.array([[5.0, 4, 3, 3, 3]]),) * 3, jnp.array([[11, 21, 31, 31, 31]])),
+    iterations=jnp.array([3]),
+    stop=jnp.array([StopReason.TOLX]),
 )
 
 
@@ -55,7 +60,7 @@ def written(tmp_path_factory):
 
 def test_the_files_are_there_and_nothing_else(written):
     names = {path.name for path in written[0].iterdir()}
-    assert names == {"mesh.glb", "grid.npz", "overview.png", "result.json"}
+    assert names == {"mesh.glb", "grid.npz", "trace.npz", "overview.png", "result.json"}
 
 
 def test_the_result_holds_the_figures_and_the_scores(written):
@@ -64,6 +69,7 @@ def test_the_result_holds_the_figures_and_the_scores(written):
     assert result["seed"] == 4 and result["frames"] == 1
     assert (result["objective_encoder"], result["objective_refined"]) == (0.5, 0.25)
     assert (result["voxels_measured"], result["voxels_occluded"]) == (4 * 24**2, 20 * 24**2)
+    assert (result["iterations"], result["evaluations"], result["stop"]) == (3, 31, "tolx")
     assert result["iou_encoder"] == pytest.approx(8 / 20)
     assert result["iou_refined"] == pytest.approx(float(iou(COMPLETED, TRUTH))) == 16 / 20
     assert result["iou_composed"] == pytest.approx(16 / 20)
@@ -82,6 +88,21 @@ def test_the_grids_load_without_pickle_and_agree(written):
         np.testing.assert_array_equal(grids["T_world_object"], T_WORLD_OBJECT)
         np.testing.assert_array_equal(grids["voxel_size"], OBSERVATION.frame.voxel_size)
         np.testing.assert_array_equal(grids["origin"], OBSERVATION.frame.origin)
+
+
+def test_the_trace_ends_where_the_search_did(written):
+    trace = read_trace(written[0] / "trace.npz")
+    np.testing.assert_array_equal(trace.evaluations, [11, 21, 31])
+    np.testing.assert_array_equal(trace.best_loss, [5, 4, 3])
+
+
+def test_the_encoder_alone_leaves_no_trace_of_an_earlier_search(tmp_path, monkeypatch):
+    monkeypatch.setattr(output, "overview", lambda *args, **settings: None)
+    (tmp_path / "trace.npz").write_bytes(b"earlier")
+    alone = RECONSTRUCTION._replace(trace=None, iterations=None, stop=None)
+    result = write_result(tmp_path, OBSERVATION, alone, {})
+    assert (result["iterations"], result["evaluations"], result["stop"]) == (0, 1, None)
+    assert not (tmp_path / "trace.npz").exists()
 
 
 def test_the_mesh_is_closed_and_lies_in_the_world(written):

@@ -8,7 +8,6 @@ from PIL import Image
 
 from jaxshape.results.pictures import (
     COLORS,
-    convergence,
     depth_panels,
     draw_voxels,
     grid_panel,
@@ -213,15 +212,6 @@ def test_an_overview_is_1600_wide_and_whole(tmp_path, frames, aspect):
     first = path.read_bytes()
     overview(path, depth_frames=depth, columns=columns, caption="a caption")
     assert path.read_bytes() == first
-
-
-def test_convergence_takes_traces_of_different_lengths(tmp_path):
-    falling = np.linspace(1, 0, 20) + np.zeros((5, 1))
-    convergence(tmp_path / "plot.png", {"CMA-ES": falling, "Adam": falling[:1, :7]})
-    with Image.open(tmp_path / "plot.png") as image:
-        pixels = np.array(image.convert("RGB")).astype(int)
-    for color in (COLORS["measured"], COLORS["predicted"]):
-        assert (np.abs(pixels - rgb(color)).max(axis=-1) < 8).sum() > 100
 
 
 def test_draw_voxels_shows_the_picture_alone():

@@ -1,0 +1,214 @@
+"""Plots of searches: how losses fell, and what became of the distribution, as pycma draws them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxshape.files import atomic_path
+from jaxshape.refine.refiner import Distribution, Trace
+from jaxshape.results.traces import Search, restarts
+
+SUFFIXES = (".png", ".svg", ".pdf")
+
+# The palette of Okabe and Ito, whose colours the common kinds of colour blindness keep apart.
+_BLUE, _ORANGE, _GREEN = "#0072B2", "#E69F00", "#009E73"
+_LINES = (_BLUE, _ORANGE, _GREEN, "#CC79A7", "#56B4E9", "#D55E00")
+_INK, _FAINT = "#2B2F33", "#E3E6E8"
+
+
+def plot_search(path: str | Path, search: Search) -> None:
+    """Plot one search over the objectives it evaluated: a panel for each thing its trace tells.
+
+    The distance of the losses to the lowest of all (gaps are the lowest itself); step size and
+    ratio of the axes; the standard deviation of every coordinate; the lengths of the principal
+    axes. Without a distribution, the spread of the candidates takes the place of the last three.
+    Dashed lines are restarts. ValueError for a suffix that is no format of pictures and for a
+    search that ended before its first iteration.
+    """
+    trace = search.trace
+    evaluations, normal = trace.evaluations, trace.distribution
+    panels: list[Callable[[Any], None]] = [lambda axes: _losses(axes, trace)]
+    if normal is not None:
+        deviations, lengths = normal.standard_deviations, normal.axis_lengths
+        panels += [
+            lambda axes: _step_size(axes, evaluations, normal),
+            lambda axes: _bundle(axes, "standard deviations", evaluations, deviations),
+            lambda axes: _bundle(axes, "lengths of the principal axes", evaluations, lengths),
+        ]
+    elif np.any(trace.spread > 0):
+        panels.append(lambda axes: _spread(axes, trace))
+    again = restarts(trace)
+
+    def draw(figure: Any) -> None:
+        rows, columns = -(-len(panels) // 2), min(2, len(panels))
+        grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+        for axes, panel in zip(grid.flat, panels, strict=True):
+            panel(axes)
+            axes.set_yscale("log")
+            _tidy(axes)
+            for iteration in again:
+                axes.axvline(evaluations[iteration], color=_INK, linewidth=0.8, dashes=(4, 3))
+        for axes in grid[-1]:
+            axes.set_xlabel("evaluations")
+        figure.suptitle(_heading(search, len(again)), fontsize=10, color=_INK)
+
+    size = {1: (4.4, 3.4), 2: (5.8, 3.0), 4: (5.8, 5.0)}[len(panels)]
+    _save(path, size, [search], draw)
+
+
+def compare_searches(path: str | Path, searches: Sequence[Search]) -> None:
+    """Plot the lowest loss so far of several searches over the objectives they evaluated."""
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        for search, color in zip(searches, _cycle(searches), strict=True):
+            label = f"{search.name} ({search.result.get('method', '?')})"
+            trace = search.trace
+            axes.step(
+                trace.evaluations, trace.best_loss, where="post", color=color, label=label, lw=1.8
+            )
+            axes.plot(trace.evaluations[-1], trace.best_loss[-1], "o", color=color, markersize=5)
+        axes.set_yscale("log")
+        axes.set_xlabel("evaluations")
+        axes.set_title("lowest objective so far")
+        _tidy(axes)
+        axes.legend(frameon=False)
+
+    _save(path, (5.6, 4.0), searches, draw)
+
+
+def convergence(
+    path: str | Path, traces: Mapping[str, Float[np.ndarray, "_ _"]], *, label: str = "objective"
+) -> None:
+    """Plot the mean of objective by iteration, and the middle 80 % of the objects as a band.
+
+    Each trace is indexed by object and iteration; there may be one per refiner, and none need be
+    as long as another.
+    """
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        for (name, trace), color in zip(traces.items(), _cycle(traces), strict=True):
+            iteration = np.arange(trace.shape[1])
+            low, high = np.percentile(trace, (10, 90), axis=0)
+            axes.fill_between(iteration, low, high, color=color, alpha=0.15, linewidth=0)
+            axes.plot(iteration, trace.mean(axis=0), color=color, linewidth=1.8, label=name)
+        axes.set_xlabel("iteration")
+        axes.set_ylabel(label)
+        _tidy(axes)
+        if len(traces) > 1:
+            axes.legend(frameon=False)
+
+    _save(path, (5.6, 3.6), [], draw)
+
+
+# ------------------------------------------------------------------ the panels of one search
+
+
+def _losses(axes: Any, trace: Trace) -> None:
+    lowest = float(min(trace.loss.min(), trace.best_loss.min()))
+    of_iteration = _above(trace.loss, lowest)
+    axes.plot(trace.evaluations, of_iteration, color=_ORANGE, lw=0.9, label="of the iteration")
+    axes.plot(trace.evaluations, _above(trace.best_loss, lowest), color=_BLUE, lw=1.8, label="best")
+    axes.set_title(f"objective above the lowest, {lowest:.4f}")
+    axes.legend(frameon=False)
+
+
+def _above(losses: Float[Array | np.ndarray, " n"], lowest: float) -> Float[np.ndarray, " n"]:
+    """The excess over the lowest loss, NaN where there is none to show on a logarithmic axis."""
+    excess = np.asarray(losses, np.float64) - lowest
+    return np.where((excess > 0) & np.isfinite(excess), excess, np.nan)
+
+
+def _step_size(axes: Any, evaluations: Any, normal: Distribution) -> None:
+    ratio = normal.axis_lengths[:, -1] / normal.axis_lengths[:, 0]
+    axes.plot(evaluations, normal.sigma, color=_GREEN, lw=1.8, label="sigma")
+    axes.plot(evaluations, ratio, color=_ORANGE, lw=1.8, label="axis ratio")
+    axes.set_title("step size and axis ratio")
+    axes.legend(frameon=False)
+
+
+def _bundle(axes: Any, title: str, evaluations: Any, values: Any) -> None:
+    """A line per column, from dark to light by where it stands at last."""
+    from matplotlib import colormaps
+
+    order = np.argsort(np.argsort(values[-1]))
+    for column, place in zip(values.T, order, strict=True):
+        color = colormaps["viridis"](0.9 * place / max(1, len(order) - 1))
+        axes.plot(evaluations, column, color=color, linewidth=0.7)
+    axes.set_title(title)
+
+
+def _spread(axes: Any, trace: Trace) -> None:
+    axes.plot(trace.evaluations, trace.spread, color=_GREEN, lw=1.8)
+    axes.set_title("spread of the candidates")
+
+
+def _heading(search: Search, restarts: int) -> str:
+    result, trace = search.result, search.trace
+    again = f", {restarts} restart{'s' * (restarts > 1)}" if restarts else ""
+    return (
+        f"{result.get('method', '?')} stopped by {result.get('stop', '?')}\n"
+        f"objective {result['objective_encoder']:.4f} to {result['objective_refined']:.4f}\n"
+        f"{len(trace.loss)} iterations, {trace.evaluations[-1]} evaluations{again}"
+    )
+
+
+# ------------------------------------------------------------------ shared by the plots
+
+
+def _cycle(lines: Any) -> list[str]:
+    return [_LINES[i % len(_LINES)] for i in range(len(lines))]
+
+
+def _tidy(axes: Any) -> None:
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
+
+    axes.grid(color=_FAINT, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(x=0.02)
+    if axes.get_yscale() == "log":
+        low, high = axes.get_ylim()
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        if high < 100 * low:  # too few powers of ten to tell where one is
+            narrow, wide = MaxNLocator(5, steps=[1, 2, 5, 10]), LogLocator(subs=(1, 2, 5))
+            axes.yaxis.set_major_locator(narrow if high < 10 * low else wide)
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_locator(NullLocator())
+
+
+def _save(
+    path: str | Path,
+    size: tuple[float, float],
+    searches: Sequence[Search],
+    draw: Callable[[Any], None],
+) -> None:
+    """Write a figure of a size in inches, in the format that the suffix names."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise ValueError(
+            f"A plot is written as one of {', '.join(SUFFIXES)}, but {str(path)!r} ends in "
+            f"{Path(path).suffix or 'no suffix'!r}."
+        )
+    for search in searches:
+        if len(search.trace.loss) == 0:
+            raise ValueError(f"The search of {search.name!r} ended before its first iteration.")
+    # Slow to import, and only pictures need it.
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    style: dict[Any, Any] = {
+        "font.size": 10,
+        "axes.titlesize": 10,
+        "legend.fontsize": 9,
+        "text.color": _INK,
+        "axes.edgecolor": _INK,
+        "svg.hashsalt": "jaxshape",  # the same file for the same search
+    }
+    with rc_context(style), atomic_path(path) as temporary:
+        figure = Figure(figsize=size, dpi=200, layout="constrained")
+        draw(figure)
+        figure.savefig(temporary)

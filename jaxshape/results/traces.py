@@ -1,0 +1,86 @@
+"""The course of a search on disk, `trace.npz` of a result folder. [host]"""
+
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxshape.files import atomic_path
+from jaxshape.refine.refiner import Distribution, Trace
+
+
+class TraceError(ValueError):
+    """A result folder holds no course of a search."""
+
+
+class Search(NamedTuple):
+    """One search as its result folder tells of it."""
+
+    name: str
+    """Of the folder."""
+    trace: Trace
+    """NumPy arrays with one row per iteration."""
+    result: dict[str, Any]
+    """The content of result.json."""
+
+
+def write_trace(path: str | os.PathLike[str], trace: Trace) -> None:
+    """Write the trace of ONE search, a row per iteration, atomically."""
+    arrays: dict[str, Any] = trace._asdict()
+    distribution = arrays.pop("distribution")
+    arrays |= distribution._asdict() if distribution else {}
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
+
+
+def read_trace(path: str | os.PathLike[str]) -> Trace:
+    """Read what `write_trace` wrote; `TraceError` for a file that is something else."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        drawn = {name: arrays.pop(name) for name in Distribution._fields if name in arrays}
+        return Trace(**arrays, distribution=Distribution(**drawn) if drawn else None)
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as problem:
+        raise TraceError(f"{str(path)!r} cannot be read as a trace: {problem}.") from None
+
+
+def read_search(folder: str | os.PathLike[str]) -> Search:
+    """Read the search of a folder made by `jaxshape reconstruct` or `jaxshape demo`.
+
+    `TraceError` where the folder is none of these, was made before traces were kept, or holds the
+    encoder's answer, for which nothing was searched.
+    """
+    folder = Path(folder)
+    if not (folder / "result.json").is_file():
+        raise TraceError(
+            f"{str(folder)!r} is not a result folder: result.json is missing. Give one made by "
+            "`jaxshape reconstruct` or `jaxshape demo`."
+        )
+    try:
+        result = json.loads((folder / "result.json").read_text())
+    except ValueError as problem:
+        raise TraceError(f"{str(folder / 'result.json')!r} is damaged: {problem}.") from None
+    if result.get("method") == "encoder":
+        raise TraceError(
+            f"{str(folder)!r} holds the encoder's answer, for which nothing was searched; "
+            "choose another --method to have something to plot."
+        )
+    if not (folder / "trace.npz").is_file():
+        raise TraceError(
+            f"{str(folder)!r} holds no trace.npz: it was made by a version that kept none. "
+            "Make it again."
+        )
+    return Search(folder.resolve().name, read_trace(folder / "trace.npz"), result)
+
+
+def restarts(trace: Trace) -> Int[np.ndarray, " n"]:
+    """The iterations after which a population started again, its axes all equal once more."""
+    if trace.distribution is None:
+        return np.zeros(0, int)
+    lengths = np.asarray(trace.distribution.axis_lengths)
+    is_round = lengths[:, -1] <= (1 + 1e-5) * lengths[:, 0]
+    return np.flatnonzero(is_round[1:] & ~is_round[:-1]) + 1

@@ -1,0 +1,68 @@
+"""Compiled programs are kept for the next process, unless the user or the disk says otherwise."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from jaxshape.process import keep_compiled
+
+FOLDER, SMALLEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+
+
+@pytest.fixture
+def environment(monkeypatch, tmp_path):
+    """What the process sees of its environment: nothing of ours, and a cache of its own."""
+    ours = {name: x for name, x in os.environ.items() if name not in (FOLDER, SMALLEST)}
+    ours["XDG_CACHE_HOME"] = str(tmp_path)
+    monkeypatch.setattr(os, "environ", ours)
+    return ours
+
+
+PROGRAM = """
+from jaxshape.process import keep_compiled
+keep_compiled()
+import jax
+hits = []
+jax.monitoring.register_event_listener(lambda name, **_: hits.append(name.endswith("cache_hits")))
+jax.jit(lambda x: x + 1)(1.0).block_until_ready()
+print(sum(hits))
+"""
+
+
+def test_the_second_process_finds_what_the_first_compiled(environment, tmp_path):
+    def hits(**settings):
+        command = [sys.executable, "-c", PROGRAM]
+        answer = subprocess.run(
+            command, env=environment | settings, capture_output=True, text=True, check=True
+        )
+        assert "warning" not in answer.stderr.lower(), answer.stderr
+        return int(answer.stdout)
+
+    assert hits(JAX_ENABLE_COMPILATION_CACHE="false") == 0
+    assert not list(tmp_path.glob("jaxshape/compiled/*"))
+    assert hits() == 0
+    assert hits() > 0
+    assert (tmp_path / "jaxshape/compiled").stat().st_mode & 0o077 == 0
+
+
+def test_the_folder_of_the_user_wins(environment, tmp_path):
+    environment[FOLDER] = "elsewhere"
+    keep_compiled()
+    assert environment[FOLDER] == "elsewhere" and SMALLEST not in environment
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_cache_that_cannot_be_written_is_not_used(environment, tmp_path):
+    (tmp_path / "file").write_text("")
+    environment["XDG_CACHE_HOME"] = str(tmp_path / "file")
+    keep_compiled()
+    assert FOLDER not in environment
+
+
+def test_without_its_own_variable_the_cache_lies_in_the_home(environment, tmp_path):
+    del environment["XDG_CACHE_HOME"]
+    environment["HOME"] = str(tmp_path)
+    keep_compiled()
+    assert environment[FOLDER] == str(tmp_path / ".cache" / "jaxshape" / "compiled")
