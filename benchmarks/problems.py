@@ -1,0 +1,102 @@
+"""What is solved: test chairs as measured by four frames, with the weights that are shipped."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+import jaxshape as js
+from jaxshape.data.capture import camera_distance
+from jaxshape.model.weights import ShapePrior
+from jaxshape.refine.config import Precision
+from jaxshape.refine.objective import Target
+from jaxshape.refine.run import Refined
+from jaxshape.refine.space import whitened
+
+PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
+
+FIRST_CHAIR = 1_000_000
+"""Seeds from here on are kept for tests: no network has seen these chairs."""
+
+
+class Problem(NamedTuple):
+    """A batch of objects to refine."""
+
+    prior: ShapePrior
+    occupied: Bool[Array, "object x y z"]
+    occluded: Bool[Array, "object x y z"]
+    surface: Bool[Array, "object x y z"]
+    code: Float[Array, "object d"]
+    target: Target
+
+
+@lru_cache
+def chairs(count: int, frames: int = 4) -> Problem:
+    """The first test chairs, after some frames of an orbit."""
+    prior = js.load_prior()
+    measured, surface = zip(*[_look_at(FIRST_CHAIR + i, frames) for i in range(count)], strict=True)
+    measured, surface = jax.tree.map(lambda *x: jnp.stack(x), *measured), jnp.stack(surface)
+    F, M = js.occupied(measured), js.occluded(measured)
+
+    @jax.jit
+    def start(F, M):
+        code = js.encode(prior.params, F)
+        return code, js.target(F, M, js.decode(prior.params, code))
+
+    return Problem(prior, F, M, surface, *start(F, M))
+
+
+def _look_at(seed: int, frames: int) -> tuple[js.Measurement, Bool[Array, "x y z"]]:
+    mesh = js.random_chair(seed)
+    seen = js.capture(mesh, js.orbit(frames, camera_distance(mesh)), noise=False, seed=seed)
+    return js.merge_all(js.measure_frames(seen)), seen.surface
+
+
+def tiled(count: int) -> Problem:
+    """As many objects, of few different ones: for measuring time and memory."""
+    few = chairs(min(count, 4))
+    batch = jax.tree.map(lambda x: x[jnp.arange(count) % len(x)], few[1:])
+    return Problem(few.prior, *batch)
+
+
+def nearby_codes(problem: Problem, count: int, seed: int = 0) -> Float[Array, "n d"]:
+    """Candidates about the first object's code, as a search would draw them."""
+    z = jax.random.normal(jax.random.key(seed), (count, problem.code.shape[-1]))
+    return problem.code[0] + 0.1 * z @ jnp.linalg.cholesky(problem.prior.code_covariance).T
+
+
+# ------------------------------------------------------------------ our side of the comparisons
+
+
+def score(
+    decoder: js.PreparedDecoder, codes: Float[Array, "n d"], target: Target
+) -> Float[Array, " n"]:
+    """Eq. 7 of each candidate of one object, as a search scores them."""
+    return jax.vmap(js.objective, (None, 0, None))(decoder, codes, target)
+
+
+def search(
+    prior: ShapePrior, iterations: int, population: int = 17
+) -> Callable[[Key[Array, " object"], Float[Array, "object d"], Target], Refined]:
+    """CMA-ES of objects with `keys, codes, targets`, for a fixed number of iterations."""
+    config = js.RefineConfig(iterations=iterations, population=population, tolerance=0)
+    refiner, space = js.refiner_for("cma", prior, config), whitened(prior)
+
+    def run(keys, codes, targets):
+        return js.refine(keys, prior.params, codes, targets, refiner, iterations, space=space)
+
+    return run
+
+
+def keys(count: int) -> Key[Array, " object"]:
+    """One random key per object."""
+    return jax.random.split(jax.random.key(0), count)
+
+
+def whitening(prior: ShapePrior) -> Float[np.ndarray, "d d"]:
+    """L with code = first code + L u, where u has unit covariance over the training codes."""
+    return np.linalg.cholesky(np.asarray(prior.code_covariance, np.float64))
