@@ -22,8 +22,9 @@ $(VENV)/.develop: $(VENV)/.runtime
 demo: $(VENV)/.runtime
 	$(BIN)/jaxshape demo
 
+# One process for each core; most of their time goes into compiling.
 test: $(VENV)/.develop
-	$(BIN)/python -m pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(VENV)/.develop
 	$(BIN)/python -m pytest -m slow
