@@ -208,13 +208,11 @@ def decode(
 
 
 def _decode(decoder: PreparedDecoder, code: Float[Array, "b d"]) -> Float[Array, "b x y z"]:
-    dtype = decoder.first.dtype
-    x = jnp.einsum(
-        "bd,xyzcd->bxyzc", code.astype(dtype), decoder.first, preferred_element_type=jnp.float32
-    )
+    code = code.astype(decoder.first.dtype)
+    x = jnp.einsum("bd,xyzcd->bxyzc", code, decoder.first, preferred_element_type=jnp.float32)
     *biases, last = decoder.biases
     for kernel, bias in zip(decoder.kernels, biases, strict=True):
-        x = upsample_prepared(nn.leaky_relu(x + bias, LEAKY_SLOPE).astype(dtype), kernel)
+        x = upsample_prepared(nn.leaky_relu(x + bias, LEAKY_SLOPE), kernel)
     # The output layer is (tanh(x) + 1) / 2 = sigmoid(2 x); 2 x is its logit.
     return 2.0 * (x[..., 0].astype(jnp.float32) + last)
 

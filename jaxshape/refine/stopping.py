@@ -48,6 +48,8 @@ class Tolerances:
 class History(NamedTuple):
     """What the criteria remember; newest entries first."""
 
+    tolstagnation: Int[Array, ""]
+    """Generations without improvement that end a search; restarts keep that of the first run."""
     best_losses: Float[Array, " short"]
     """Of recent generations; +inf before the first."""
     recorded: Int[Array, ""]
@@ -72,10 +74,22 @@ class History(NamedTuple):
 def no_history(point: Float[Array, " d"], population: int) -> History:
     """The history of a search before its first generation."""
     dim, zero = len(point), jnp.int32(0)
-    short = jnp.full(_recent(dim, population), jnp.inf, point.dtype)
-    long = jnp.full(2 * _window(dim, population), jnp.inf, point.dtype)
-    none = jnp.full((), jnp.inf, point.dtype)
-    return History(short, zero, long, long, zero, point, zero, none, zero, jnp.bool_(False))
+    nothing = lambda *shape: jnp.full(shape, jnp.inf, point.dtype)  # noqa: E731
+    tolstagnation = 100 + math.floor(100 * dim**1.5) // population
+    long = nothing(2 * _window(tolstagnation))
+    return History(
+        tolstagnation=jnp.int32(tolstagnation),
+        best_losses=nothing(_recent(dim, population)),
+        recorded=zero,
+        long_best=long,
+        long_median=long,
+        flat=zero,
+        anchor=point,
+        anchored=zero,
+        lowest=nothing(),
+        improved=zero,
+        stagnates=jnp.bool_(False),
+    )
 
 
 def _recent(dim: int, population: Any) -> Any:
@@ -83,14 +97,9 @@ def _recent(dim: int, population: Any) -> Any:
     return 10 + 30 * dim // population
 
 
-def _stagnation(dim: int, population: Any) -> Any:
-    """pycma's default number of generations without improvement, 100 + 100 d^1.5 / population."""
-    return 100 + math.floor(100 * dim**1.5) // population
-
-
-def _window(dim: int, population: Any) -> Any:
+def _window(tolstagnation: Any) -> Any:
     """Entries of the long history in each of the two windows that are compared."""
-    return _stagnation(dim, population) // (2 * RECORD_EVERY)
+    return tolstagnation // (2 * RECORD_EVERY)
 
 
 def check(
@@ -125,7 +134,7 @@ def _remember(
 ) -> History:
     """The history with this generation in it."""
     old, now = state.history, state.generation
-    best, window = ranked[0], _window(len(state.mean), population)
+    best, window = ranked[0], _window(old.tolstagnation)
     median = (ranked[(population - 1) // 2] + ranked[population // 2]) / 2
     record = now % RECORD_EVERY == 0
     # The longer the mean has stood still, the further it must go to count as moving.
@@ -135,6 +144,7 @@ def _remember(
     recorded = old.recorded + record
     winner = (now - 1) * population + jnp.argmin(losses) + 1
     history = History(
+        tolstagnation=old.tolstagnation,
         best_losses=_push(old.best_losses, best),
         recorded=recorded,
         long_best=jnp.where(record, _push(old.long_best, best), old.long_best),
@@ -147,7 +157,7 @@ def _remember(
         stagnates=old.stagnates,
     )
     due = record & (recorded > jnp.maximum(2 * window, 100))
-    return apply_if(due, _compare_windows, history, jnp.int32(window))[0]
+    return apply_if(due, _compare_windows, history)[0]
 
 
 def _push(values: Float[Array, " n"], newest: Float[Array, ""]) -> Float[Array, " n"]:
@@ -184,7 +194,7 @@ def _criteria(
 
     stagnates = history.stagnates & (now > dim * (5 + 100 / population))
     since = (now * population - history.improved) / population
-    stagnates &= since > _stagnation(dim, population) / 2
+    stagnates &= since > history.tolstagnation / 2
 
     axis = now % dim
     axis_step = 0.1 * state.sigma * state.scales[axis] * state.basis[:, axis]
@@ -205,8 +215,9 @@ def _criteria(
     }
 
 
-def _compare_windows(history: History, window: Int[Array, ""]) -> tuple[History, Int[Array, ""]]:
+def _compare_windows(history: History) -> tuple[History]:
     """Whether neither best nor median losses are lower in the newer of two windows."""
+    window = _window(history.tolstagnation)
     place = jnp.arange(len(history.long_best))
 
     def median(values, first):
@@ -215,4 +226,4 @@ def _compare_windows(history: History, window: Int[Array, ""]) -> tuple[History,
         return (ranked[(window - 1) // 2] + ranked[window // 2]) / 2
 
     both = [median(x, 0) >= median(x, window) for x in (history.long_best, history.long_median)]
-    return history._replace(stagnates=both[0] & both[1]), window
+    return (history._replace(stagnates=both[0] & both[1]),)
