@@ -28,7 +28,7 @@ COMMANDS = ("demo", "dataset", "train", "reconstruct", "evaluate", "plot")
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Run a command in this process; returns its exit status, its answer and its complaint."""
-    monkeypatch.setattr(cli, "keep_compiled", lambda: None)
+    monkeypatch.setattr(cli, "prepare_process", lambda: None)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["jaxshape", *map(str, arguments)])

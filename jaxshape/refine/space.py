@@ -29,9 +29,13 @@ class LatentSpace(NamedTuple):
         return self.mean + step
 
     def from_code(self, code: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The point of a code; the nearest one inside where it lies outside the bounds."""
+        """The point of a code; the nearest one inside where it lies outside the bounds.
+
+        Close to the bounds `to_code` moves it a little further in: at the very edge, where the
+        fold turns back, a gradient could not leave again.
+        """
         point = jax.scipy.linalg.solve_triangular(self.root, code - self.mean, lower=True)
-        return unfold(point, self.bound)
+        return point if self.bound is None else jnp.clip(point, -self.bound, self.bound)
 
 
 def whitened(prior: ShapePrior, bound: float | None = None) -> LatentSpace:
@@ -60,13 +64,3 @@ def fold(point: Float[Array, "*n"], bound: Float[Array, ""] | float | None) -> F
     inner = jnp.abs(wrapped) - (bound - margin)
     bent = jnp.sign(wrapped) * (bound - (2 * margin - inner) ** 2 / (4 * margin))
     return jnp.where(inner > 0, bent, wrapped)
-
-
-def unfold(point: Float[Array, "*n"], bound: Float[Array, ""] | float | None) -> Float[Array, "*n"]:
-    """The number nearest 0 that `fold` maps to this one, or to the end beyond which it lies."""
-    if bound is None:
-        return point
-    margin = 0.1 * bound
-    size = jnp.minimum(jnp.abs(point), bound)
-    bent = bound + margin - 2 * jnp.sqrt(margin * (bound - size))
-    return jnp.where(size > bound - margin, jnp.sign(point) * bent, point)

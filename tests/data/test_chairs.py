@@ -116,9 +116,9 @@ def test_so_many_seeds_give_as_many_chairs_of_all_styles(count, without_shape_ch
         digests.add(digest(mesh))
         styles[mesh.metadata["style"]] += 1
     assert len(digests) == count
-    for style, count in styles.items():
+    for style, seen in styles.items():
         expected = count * FREQUENCIES[style]
-        assert abs(count - expected) < 5 * np.sqrt(expected) + 1, style
+        assert abs(seen - expected) < 5 * np.sqrt(expected) + 1, style
 
 
 def test_neighbouring_seeds_look_different(without_shape_checks):

@@ -116,7 +116,7 @@ def test_a_few_examples_at_a_time_give_the_same_as_all_at_once(monkeypatch, case
     assert_close(jax.jit(lambda *x: cpu_forms(*x))(*arrays), looped(*arrays))
 
 
-@pytest.mark.parametrize("values", [1, 1000, 10**6])
+@pytest.mark.parametrize("values", [1, 1000, 10**5])
 def test_the_chunks_fill_the_cache_and_no_more(values):
     size = convolution._in_cache(values)
     assert size * values * 4 <= convolution.CACHE_BYTES < (size + 1) * values * 4
