@@ -43,11 +43,11 @@ def chairs(count: int, frames: int = 4) -> Problem:
     F, M = js.occupied(measured), js.occluded(measured)
 
     @jax.jit
-    def start(F, M):
-        code = js.encode(prior.params, F)
-        return code, js.target(F, M, js.decode(prior.params, code))
+    def start(params, F, M):
+        code = js.encode(params, F)
+        return code, js.target(F, M, js.decode(params, code))
 
-    return Problem(prior, F, M, surface, *start(F, M))
+    return Problem(prior, F, M, surface, *start(prior.params, F, M))
 
 
 def _look_at(seed: int, frames: int) -> tuple[js.Measurement, Bool[Array, "x y z"]]:
