@@ -38,6 +38,7 @@ from matplotlib.figure import Figure
 from scipy.stats import fisher_exact
 
 from jaxshape.files import atomic_path
+from jaxshape.refine.batching import select
 from jaxshape.refine.refiner import StopReason
 from jaxshape.refine.restarts import with_restarts
 
@@ -177,7 +178,7 @@ def ours(dimension: int, restarts: Restarts) -> Search:
         running = state.stop == StopReason.RUNNING
         awake = lambda point: objective(jnp.where(running, point, jnp.nan))  # noqa: E731
         moved, _ = refiner.step(jax.random.fold_in(key, number), state, awake)
-        return jax.tree.map(lambda new, old: jnp.where(running, new, old), moved, state)
+        return select(running, moved, state)
 
     @jax.jit
     def advance(keys, states, numbers):

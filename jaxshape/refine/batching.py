@@ -1,4 +1,4 @@
-"""Branches that stay branches under `jax.vmap`."""
+"""Choices by a traced truth: between trees, and branches that stay branches under `jax.vmap`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,7 +29,7 @@ def apply_if(due: Bool[Array, ""], function: Callable[..., Any], *operands: PyTr
         )
 
         def each(due, *old):
-            return due, *jax.vmap(lambda due, *old: _select(due, function(*old), old))(due, *old)
+            return due, *jax.vmap(lambda due, *old: select(due, function(*old), old))(due, *old)
 
         _, *done = apply_if(jnp.any(due), each, due, *operands)  # which may be batched again
         return tuple(done), jax.tree.map(lambda _: True, tuple(done))
@@ -37,5 +37,6 @@ def apply_if(due: Bool[Array, ""], function: Callable[..., Any], *operands: PyTr
     return branch(due, *operands)
 
 
-def _select(wanted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
+def select(wanted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
+    """`new` where wanted, else `old`; for trees of the same shapes."""
     return jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, old)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.refine import cma, stopping
-from jaxshape.refine.batching import apply_if
+from jaxshape.refine.batching import apply_if, select
 from jaxshape.refine.refiner import (
     Candidate,
     Objective,
@@ -121,7 +121,7 @@ def with_restarts(
         over = (search.stop != StopReason.RUNNING) | (run.iterations >= run.allowed)
         last = over & (state.large_runs >= doublings)
         again = begin_again(restart_key, state)
-        state = jax.tree.map(lambda new, old: jnp.where(over & ~last, new, old), again, state)
+        state = select(over & ~last, again, state)
         state = state._replace(stop=jnp.where(last, search.stop, StopReason.RUNNING))
         evaluations = 1 + size * (state.spent_small + state.spent_large + state.run.iterations)
         shape = cma.distribution(state.search)

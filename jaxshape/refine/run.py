@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from jaxshape.model.autoencoder import decode, prepare_decoder
+from jaxshape.refine.batching import select
 from jaxshape.refine.config import Precision
 from jaxshape.refine.objective import Target, cross_entropy, objective
 from jaxshape.refine.refiner import Objective, Refiner, StopReason, Trace, finite_or_inf
@@ -89,9 +90,7 @@ def refine(
         loss, running = loss_of(target), state.stop == StopReason.RUNNING
         awake = lambda point: loss(jnp.where(running, point, jnp.nan))  # noqa: E731
         moved = refiner.step(key, state, awake)
-        state, trace = jax.tree.map(
-            lambda new, old: jnp.where(running, new, old), moved, (state, trace)
-        )
+        state, trace = select(running, moved, (state, trace))
         return _stop_at(target_loss, state), trace
 
     def iterate(carry, number):

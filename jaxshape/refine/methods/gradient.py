@@ -9,6 +9,7 @@ import optax
 import optax.tree_utils
 from jaxtyping import Array, Float, Int
 
+from jaxshape.refine.batching import select
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.refiner import (
     Candidate,
@@ -102,9 +103,7 @@ def gradient(
         moved = (optax.apply_updates(point, updates), optimizer_state)
         restarted = (best.point, transformation.init(best.point))
         usable = jnp.isfinite(loss) & jnp.all(jnp.isfinite(slope))
-        mean, optimizer_state = jax.tree.map(
-            lambda new, old: jnp.where(usable, new, old), moved, restarted
-        )
+        mean, optimizer_state = select(usable, moved, restarted)
         is_still = jnp.abs(loss - state.last_loss) < tolerance
         still = jnp.where(is_still, state.still + 1, 0)
         searched = optax.tree_utils.tree_get(optimizer_state, "num_linesearch_steps", 0)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxshape.refine.batching import select
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.methods import build_refiner
 from jaxshape.refine.refiner import Candidate, Objective, Refiner, StopReason, Trace
@@ -58,13 +59,13 @@ def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
         search_key, polish_key, begin_key = jax.random.split(key, 3)
         polishing = state.polishing
         stepped = search.step(search_key, state.searched[0], only(~polishing))
-        searched, trace = _select(polishing, state.searched, stepped)
+        searched, trace = select(polishing, state.searched, stepped)
         polished, polish_trace = polish.step(polish_key, state.polished, only(polishing))
         polish_trace = polish_trace._replace(
             evaluations=trace.evaluations + polish_trace.evaluations - 1,
             distribution=trace.distribution,
         )
-        best, mean, shown = _select(
+        best, mean, shown = select(
             polishing,
             (polished.best, polished.mean, polish_trace),
             (searched.best, searched.mean, trace),
@@ -74,12 +75,8 @@ def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
         count = state.iterations + 1
         begins = ~polishing & ((count >= iterations) | (searched.stop != StopReason.RUNNING))
         fresh, _ = polish.init(begin_key, best.point, best.loss)
-        polished = _select(begins, fresh, polished)
+        polished = select(begins, fresh, polished)
         state = State(mean, best, stop, (searched, trace), polished, polishing | begins, count)
         return state, shown
 
     return Refiner(init, step)
-
-
-def _select(wanted: Bool[Array, ""], yes: Any, no: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), yes, no)
