@@ -16,6 +16,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxshape.model.autoencoder import decode
+from jaxshape.model.chunks import in_chunks
 
 BALANCED_WEIGHT = 3.0
 """Weight of measured occupied voxels in the `balanced` objective; the paper has 1."""
@@ -144,13 +145,10 @@ def _by_chunks(score, size, params, codes, targets, owner):
 
     Rows whose code is not finite score NaN in any company.
     """
-    size = -(-len(codes) // -(-len(codes) // size))  # equal chunks: 17 rows go as 3 times 6
-    rows = jnp.arange(-(-len(codes) // size) * size).clip(max=len(codes) - 1).reshape(-1, size)
-    shapes = jax.eval_shape(score, params, codes[:size], _pick(targets, owner[:size]))
-    nothing = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
 
-    def chunk(rows):
-        wanted = jnp.all(jnp.isfinite(codes[rows]), axis=-1)
+    def chunk(rows, wanted):
+        shapes = jax.eval_shape(score, params, codes[rows], _pick(targets, owner[rows]))
+        nothing = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
 
         def compute():
             scored = score(params, codes[rows], _pick(targets, owner[rows]))
@@ -158,8 +156,7 @@ def _by_chunks(score, size, params, codes, targets, owner):
 
         return lax.cond(jnp.any(wanted), compute, lambda: nothing)
 
-    scored = lax.map(chunk, rows)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(codes)], scored)
+    return in_chunks(chunk, size, jnp.arange(len(codes)), jnp.all(jnp.isfinite(codes), axis=-1))
 
 
 def _one_network(params: PyTree, batched: PyTree) -> tuple[PyTree, Bool[Array, ""] | bool]:
