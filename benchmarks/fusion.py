@@ -55,7 +55,6 @@ def run(quick: bool) -> list[Metric]:
                 speedup(seconds, "jaxshape", name),
                 "x",
                 "higher",
-                tolerance=0.4,
                 target=10.0 if name == "numpy" else None,
             )
         )

@@ -17,7 +17,7 @@ from jaxshape.data.dataset import hash_seed
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.weights import ShapePrior, flatten
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import (
     Reconstruction,
@@ -172,8 +172,8 @@ def summarize(per_mesh: Sequence[dict[str, Any]], config: EvaluateConfig) -> dic
 def fingerprint(prior: ShapePrior) -> str:
     """A hash of all numbers of a shape prior: the same for the same weights, wherever they lie."""
     digest = hashlib.sha256()
-    for path, x in jax.tree_util.tree_leaves_with_path(prior):
-        digest.update(jax.tree_util.keystr(path).encode())
+    for name, x in flatten(prior).items():
+        digest.update(name.encode())
         digest.update(np.asarray(x).tobytes())
     return digest.hexdigest()
 
