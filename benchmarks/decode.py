@@ -16,7 +16,8 @@ import jaxshape as js
 from benchmarks import problems
 from benchmarks.harness import Metric, alternate, compiled, difference, fastest, optional, speedup
 from benchmarks.problems import PRECISIONS, Problem
-from jaxshape.model.autoencoder import Architecture, architecture_of
+from jaxshape.model.autoencoder import architecture_of
+from jaxshape.model.config import Architecture
 from jaxshape.refine.config import Precision
 
 POPULATIONS = (17, 64, 256)

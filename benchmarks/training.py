@@ -7,7 +7,8 @@ import numpy as np
 from benchmarks import problems
 from benchmarks.harness import Metric, alternate, compiled, difference, fastest, optional, speedup
 from benchmarks.problems import PRECISIONS
-from jaxshape.model.training import TrainConfig, initial_state, train_step
+from jaxshape.model.config import TrainConfig
+from jaxshape.model.training import initial_state, train_step
 from jaxshape.refine.config import Precision
 
 BATCH = 32
@@ -20,7 +21,9 @@ def run(quick: bool) -> list[Metric]:
 
 
 def _compare(precision: Precision, budget: float) -> list[Metric]:
-    config = TrainConfig(batch=BATCH, bfloat16=precision == "bfloat16")
+    config = TrainConfig(
+        batch=BATCH, optimizer="adam", occupied_weight=1.0, bfloat16=precision == "bfloat16"
+    )
     problem = problems.chairs(4)
     batch = [
         np.tile(np.array(x), (BATCH // 4, 1, 1, 1)) for x in (problem.occupied, problem.surface)

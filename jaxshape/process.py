@@ -1,4 +1,4 @@
-"""Settings of a process that must stand before JAX is imported. [host]"""
+"""Settings of a process that must stand before JAX computes, or is even imported. [host]"""
 
 import os
 from pathlib import Path
@@ -29,6 +29,35 @@ def keep_compiled() -> None:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     # By default, only what took a second or more; but a command also compiles dozens of small ones.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def join_processes(
+    coordinator: str | None = None, processes: int | None = None, process: int | None = None
+) -> None:
+    """Make this process one of several that compute together; to be called before JAX computes.
+
+    `coordinator` is the address, `host:port`, at which process 0 listens; `process` is this one's
+    number among the `processes`. Where none is given, JAX learns all three from Slurm, Open MPI or
+    another cluster that it knows. `ValueError` where only some are given, or no cluster is found.
+    """
+    given = {"coordinator": coordinator, "processes": processes, "process": process}
+    missing = [name for name, value in given.items() if value is None]
+    if 0 < len(missing) < len(given):
+        raise ValueError(
+            f"Without {' and '.join(missing)} the processes cannot find each other; give "
+            "coordinator, processes and process, or none where a cluster such as Slurm tells them."
+        )
+    import jax
+
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except ValueError as problem:
+        if not missing:
+            raise
+        raise ValueError(
+            "There seems to be no cluster that JAX knows, such as Slurm or Open MPI; "
+            "give coordinator, processes and process by hand."
+        ) from problem
 
 
 def _folder() -> Path | None:

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.model.autoencoder import Architecture, initialize
+from jaxshape.model.autoencoder import initialize
+from jaxshape.model.config import Architecture
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine import objective, reconstruction, run
 

@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,6 +27,7 @@ from jaxshape.data import meshes
 from jaxshape.data.archives import MeshSource
 from jaxshape.data.capture import Capture, camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
+from jaxshape.data.config import DatasetConfig
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
@@ -43,21 +44,6 @@ Object = int | MeshSource
 
 class DatasetError(ValueError):
     """A dataset folder cannot be read or continued."""
-
-
-@dataclass(frozen=True)
-class DatasetConfig:
-    """What, with the objects themselves, decides every byte of a dataset."""
-
-    views: int = 18
-    """Random views of each object (paper: 18)."""
-    noisy: float = 0.5
-    """Share of the objects whose depth images get the faults of a real sensor."""
-    up: str = "y"
-    """Axis of the mesh files that points up; one of x, y, z, -x, -y, -z."""
-    front: str = "z"
-    """Axis of the mesh files along which the object's front looks."""
-    seed: int = 0
 
 
 class Progress(NamedTuple):
@@ -84,10 +70,18 @@ def training_grids(
     """The complete surface of one object and its views, packed."""
     key = jax.random.key(seed)
     T_object_camera = camera.random_views(key, config.views, camera_distance(mesh))
-    noise = bool(np.random.default_rng(seed).random() < config.noisy)
-    captured = capture(mesh, T_object_camera, noise=noise, seed=seed)
+    captured = capture(mesh, T_object_camera, noise=_draws_noise(config, seed), seed=seed)
     views = _occupied_by_frame(captured)
     return pack(np.concatenate([np.asarray(captured.surface)[None], np.asarray(views)]))
+
+
+def is_noisy(index: int, config: DatasetConfig) -> bool:
+    """Whether the depth images of an object, by its place among all, have a sensor's faults."""
+    return _draws_noise(config, hash_seed(config.seed, index))
+
+
+def _draws_noise(config: DatasetConfig, seed: int) -> bool:
+    return bool(np.random.default_rng(seed).random() < config.noisy)
 
 
 @jax.jit
@@ -150,7 +144,7 @@ def _write_shard(
         if isinstance(model, Skipped):
             skipped.append(model)
             continue
-        seed = hash_seed(config.seed, number * OBJECTS_PER_SHARD + i)
+        seed = hash_seed(config.seed, number * OBJECTS_PER_SHARD + i)  # as in `is_noisy`
         names.append(model.name)
         grids.append(training_grids(model.mesh, config, seed))
     shape = (0, 1 + config.views, RESOLUTION**3 // 8)

@@ -5,7 +5,6 @@ parameters are the two Flax collections `params` and `batch_stats` of `AutoEncod
 imported here and nowhere else.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.model.chunks import in_chunks
+from jaxshape.model.config import Architecture
 from jaxshape.model.convolution import (
     KERNEL_SIZE,
     PreparedKernel,
@@ -38,34 +38,28 @@ LEAKY_SLOPE = 0.2
 """Not given in the paper; that of the networks whose initialisation it uses (DCGAN)."""
 
 
-@dataclass(frozen=True)
-class Architecture:
-    """Sizes of the auto-encoder; the paper gives them in a figure that is lost."""
-
-    encoder: tuple[int, int, int, int] = (32, 64, 128, 256)
-    """Channels after each of the four strided convolutions."""
-    decoder: tuple[int, int, int] = (128, 64, 32)
-    """Channels after each transposed convolution but the last, which has one."""
-    code: int = 100
-    """Dimension of the code (paper: 100)."""
-
-
 class AutoEncoder(nn.Module):
     """Encoder and decoder without skip connections, so that either can be used alone."""
 
     architecture: Architecture = Architecture()
     dtype: DTypeLike = jnp.float32
     """Of the convolutions' arithmetic; parameters and batch statistics stay float32."""
+    axis: str | None = None
+    """Mesh axis over which a batch is spread, if it is: its statistics are those of all of it."""
 
     def setup(self):
-        self.encoder = Encoder(self.architecture, self.dtype)
-        self.decoder = Decoder(self.architecture, self.dtype)
+        self.encoder = Encoder(self.architecture, self.dtype, self.axis)
+        self.decoder = Decoder(self.architecture, self.dtype, self.axis)
 
     def __call__(
-        self, grid: Bool[Array, "b x y z"] | Float[Array, "b x y z"], train: bool
-    ) -> Float[Array, "b x y z"]:
-        """Logits of the completed grid."""
-        return self.decoder(self.encoder(grid, train), train)
+        self,
+        grid: Bool[Array, "b x y z"] | Float[Array, "b x y z"],
+        train: bool,
+        noise: Float[Array, "b d"] | float = 0.0,
+    ) -> tuple[Float[Array, "b x y z"], Float[Array, "b d"]]:
+        """Logits of the completed grid, and its code, to which noise was added before decoding."""
+        code = self.encoder(grid, train)
+        return self.decoder(code + noise, train), code
 
     def encode(self, grid: Float[Array, "b x y z"], train: bool = False) -> Float[Array, "b d"]:
         return self.encoder(grid, train)
@@ -79,13 +73,14 @@ class Encoder(nn.Module):
 
     architecture: Architecture
     dtype: DTypeLike
+    axis: str | None
 
     @nn.compact
     def __call__(self, grid, train):
         x = grid[..., None].astype(self.dtype)
         for i, channels in enumerate(self.architecture.encoder):
             x = downsample(x, _kernel(self, f"conv{i}", x.shape[-1], channels).astype(self.dtype))
-            x = _normalize(x, train, f"norm{i}")
+            x = _normalize(x, train, self.axis, f"norm{i}")
         pooled = jnp.mean(x.astype(jnp.float32), axis=(1, 2, 3))
         return nn.Dense(self.architecture.code, kernel_init=WEIGHT_INIT, name="project")(pooled)
 
@@ -95,6 +90,7 @@ class Decoder(nn.Module):
 
     architecture: Architecture
     dtype: DTypeLike
+    axis: str | None
 
     @nn.compact
     def __call__(self, code, train):
@@ -103,7 +99,7 @@ class Decoder(nn.Module):
         kernel = _kernel(self, "conv0", channels[0], code.shape[-1])[1:, 1:, 1:]
         x = jnp.einsum("bd,xyzcd->bxyzc", code.astype(self.dtype), kernel.astype(self.dtype))
         for i in range(1, len(channels)):
-            x = _normalize(x, train, f"norm{i - 1}")
+            x = _normalize(x, train, self.axis, f"norm{i - 1}")
             x = upsample(x, _kernel(self, f"conv{i}", channels[i], x.shape[-1]).astype(self.dtype))
         bias = self.param("bias", nn.initializers.zeros, ())
         # The output layer is (tanh(x) + 1) / 2 = sigmoid(2 x); 2 x is its logit.
@@ -118,7 +114,7 @@ def _kernel(module, name, fine, coarse):
     return module.param(name, WEIGHT_INIT, (*[KERNEL_SIZE] * 3, fine, coarse))
 
 
-def _normalize(x, train, name):
+def _normalize(x, train, axis, name):
     """Batch normalisation, scales started at N(1, 0.02) (paper, section 2.3), and leaky relu."""
     norm = nn.BatchNorm(
         use_running_average=not train,
@@ -126,6 +122,7 @@ def _normalize(x, train, name):
         epsilon=NORM_EPSILON,
         scale_init=lambda *args: 1 + WEIGHT_INIT(*args),
         dtype=x.dtype,
+        axis_name=axis if train else None,
         name=name,
     )
     return nn.leaky_relu(norm(x), LEAKY_SLOPE)

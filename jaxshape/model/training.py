@@ -6,10 +6,11 @@ as one that was not: batches depend on the seed and the step alone.
 """
 
 import json
+import math
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -18,33 +19,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax import lax
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int, PyTree
+from optax.contrib import MuonDimensionNumbers, muon
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from jaxshape.data.dataset import Dataset, unpack
+from jaxshape.data.dataset import Dataset
+from jaxshape.data.inputs import draw_pair
 from jaxshape.files import atomic_path
-from jaxshape.model.autoencoder import Architecture, AutoEncoder, encode, initialize
-from jaxshape.model.weights import ShapePrior, flatten
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Everything that decides a training run, besides its dataset."""
-
-    architecture: Architecture = Architecture()
-    steps: int = 10_000
-    """Batches in all."""
-    batch: int = 32
-    learning_rate: float = 1e-3
-    """Peak of Adam's step size; it decays to zero along a cosine (paper: 1e-4, constant)."""
-    max_views: int = 18
-    """Inputs fuse 1 to this many random views (paper: 1)."""
-    bfloat16: bool = False
-    """Compute convolutions in bfloat16; parameters, statistics and Adam stay in float32."""
-    report_every: int = 100
-    """Steps between checkpoints and lines of metrics."""
-    seed: int = 0
+from jaxshape.model.autoencoder import AutoEncoder, architecture_of, encode, initialize
+from jaxshape.model.config import TrainConfig
+from jaxshape.model.weights import ShapePrior, fingerprint, flatten
 
 
 class TrainState(NamedTuple):
@@ -61,7 +50,7 @@ class Report(NamedTuple):
 
     step: int
     loss: float
-    """Binary cross-entropy in nats per voxel (paper, section 2.3)."""
+    """Of training, in nats per voxel (paper, section 2.3)."""
     iou: float
     """Of the completed training grids, at threshold 0.5."""
     samples_per_second: float
@@ -73,14 +62,37 @@ class Report(NamedTuple):
 
 
 def optimizer_for(config: TrainConfig) -> optax.GradientTransformation:
-    """Adam with the paper's betas, its step size decaying along a cosine after a short warm-up."""
-    warmup = min(200, config.steps // 10)
-    schedule = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, config.steps)
-    return optax.adam(schedule, b1=0.9, b2=0.999)
+    """Adam with the paper's betas, or Muon for the kernels and Adam for the rest."""
+    schedule = config.learning_rate
+    if config.schedule == "cosine":
+        warmup = min(200, config.steps // 10)
+        schedule = optax.warmup_cosine_decay_schedule(0.0, schedule, warmup, config.steps)
+    if config.optimizer == "adam":
+        return optax.adam(schedule, b1=0.9, b2=0.999)
+    return muon(
+        schedule,
+        consistent_rms=0.2,  # moves of about the size that Adam makes at this step size
+        muon_weight_dimension_numbers=partial(jax.tree.map, _as_matrix),
+    )
 
 
-def initial_state(config: TrainConfig) -> TrainState:
-    variables = initialize(jax.random.key(config.seed), config.architecture)
+def _as_matrix(weights: Array) -> MuonDimensionNumbers | None:
+    """A kernel as a matrix from all but its last axis to that; no matrix for biases and scales."""
+    axes = tuple(range(weights.ndim - 1))
+    return MuonDimensionNumbers(axes, weights.ndim - 1) if weights.ndim > 1 else None
+
+
+def initial_state(config: TrainConfig, start: ShapePrior | None = None) -> TrainState:
+    """Random weights, or those of a shape prior to go on from."""
+    if start is None:
+        variables = initialize(jax.random.key(config.seed), config.architecture)
+    elif architecture_of(start.params) == config.architecture:
+        variables = jax.tree.map(jnp.array, start.params)  # a copy: steps give theirs away
+    else:
+        raise ValueError(
+            f"The weights to start from are of {architecture_of(start.params)}, "
+            f"the run of {config.architecture}; give the same sizes to both."
+        )
     return TrainState(
         jnp.zeros((), jnp.int32), variables, optimizer_for(config).init(variables["params"])
     )
@@ -91,81 +103,141 @@ def train_step(
     measured: Bool[Array, "b x y z"],
     surface: Bool[Array, "b x y z"],
     config: TrainConfig,
+    axis: str | None = None,
 ) -> tuple[TrainState, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """One step of Adam on a batch; also its loss and mean IoU."""
-    network = AutoEncoder(config.architecture, jnp.bfloat16 if config.bfloat16 else jnp.float32)
+    """One step of Adam on a batch; also its loss and mean IoU.
+
+    Where the batch is spread over devices, `axis` names the mesh axis; each holds its part, and
+    statistics, gradients and figures are those of the whole.
+    """
+    dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32
+    network = AutoEncoder(config.architecture, dtype, axis)
+    noise = _code_noise(state.step, len(measured), config, axis)
+    over_all = partial(lax.pmean, axis_name=axis) if axis else lambda x: x
 
     def loss_of(params):
         variables = {**state.variables, "params": params}
-        logits, updates = network.apply(variables, measured, train=True, mutable=["batch_stats"])
-        loss = jnp.mean(optax.sigmoid_binary_cross_entropy(logits, surface))
-        return loss, (updates, logits > 0)
+        (logits, code), updates = network.apply(
+            variables, measured, train=True, noise=noise, mutable=["batch_stats"]
+        )
+        weights = jnp.where(surface, config.occupied_weight, 1.0)
+        loss = jnp.mean(weights * optax.sigmoid_binary_cross_entropy(logits, surface))
+        voxels = math.prod(surface.shape[1:])
+        length = 0.5 * jnp.mean(jnp.sum(code**2, axis=-1)) / voxels
+        return loss + config.code_weight * length, (updates, logits > 0)
 
     params = state.variables["params"]
     (loss, (updates, completed)), gradients = jax.value_and_grad(loss_of, has_aux=True)(params)
-    moves, optimizer = optimizer_for(config).update(gradients, state.optimizer, params)
+    moves, optimizer = optimizer_for(config).update(over_all(gradients), state.optimizer, params)
     variables = {"params": optax.apply_updates(params, moves), **updates}
     axes = (1, 2, 3)
     iou = jnp.mean(jnp.sum(completed & surface, axes) / jnp.sum(completed | surface, axes))
-    return TrainState(state.step + 1, variables, optimizer), (loss, iou)
+    return TrainState(state.step + 1, variables, optimizer), over_all((loss, iou))
+
+
+def _code_noise(step, count, config: TrainConfig, axis):
+    """Noise for each code of this device's part; a function of its place in the whole batch."""
+    if not config.code_noise:
+        return 0.0
+    key = jax.random.fold_in(jax.random.key(config.seed + 1), step)
+    first = lax.axis_index(axis) * count if axis else 0
+    keys = jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(count))
+    draw = partial(jax.random.normal, shape=(config.architecture.code,))
+    return config.code_noise * jax.vmap(draw)(keys)
 
 
 def batch_of(
-    dataset: Dataset, config: TrainConfig, step: int
+    dataset: Dataset, config: TrainConfig, step: int, part: tuple[int, int] = (0, 1)
 ) -> tuple[Bool[np.ndarray, "b x y z"], Bool[np.ndarray, "b x y z"]]:
-    """The fused views and complete surfaces of one step; a function of the seed and the step.
+    """The measurements and complete surfaces of one step; a function of the seed and the step.
 
-    Objects come in a new order each epoch; each sample fuses a random subset of its views.
+    Objects come in a new order each epoch, and each pair has random numbers of its own, so that
+    `part` i of n of a batch is what it would be in the whole.
     """
-    count = len(dataset.names)
-    places = np.arange(step * config.batch, (step + 1) * config.batch)
+    count, (index, parts) = len(dataset.names), part
+    size = config.batch // parts
+    first = step * config.batch + index * size
+    places = range(first, first + size)
     orders = {e: np.random.default_rng((config.seed, 0, e)).permutation(count)
-              for e in np.unique(places // count)}  # fmt: skip
-    rng = np.random.default_rng((config.seed, 1, step))
-    measured, surface = [], []
-    for place in places:
-        packed = dataset.packed(int(orders[place // count][place % count]))
-        views = rng.integers(1, min(config.max_views, dataset.views) + 1)
-        chosen = 1 + rng.choice(dataset.views, views, replace=False)
-        measured.append(np.bitwise_or.reduce(packed[chosen], axis=0))
-        surface.append(packed[0])
-    return unpack(np.stack(measured)), unpack(np.stack(surface))
+              for e in {place // count for place in places}}  # fmt: skip
+    pairs = [
+        draw_pair(
+            dataset.packed(int(orders[place // count][place % count])),
+            config.inputs,
+            np.random.default_rng((config.seed, 1, place)),
+        )
+        for place in places
+    ]
+    measured, surface = zip(*pairs, strict=True)
+    return np.stack(measured), np.stack(surface)
 
 
 # ------------------------------------------------------------------ a run
 
 
 def train(
-    folder: str | os.PathLike[str], dataset: Dataset, config: TrainConfig
+    folder: str | os.PathLike[str],
+    dataset: Dataset,
+    config: TrainConfig,
+    start: ShapePrior | None = None,
 ) -> Iterator[Report]:
     """Train until `config.steps`, from the checkpoint in `folder` where there is one.
 
-    Adds to `metrics.jsonl` and replaces `checkpoint.safetensors` at every report.
-    `ValueError` when the folder holds a run of other settings.
+    Begins with the weights of `start` if any are given. Each batch is spread over all devices, of
+    all processes where there are several (`jax.distributed`): each process reads its own part of
+    the dataset, and the first alone reads and writes `folder`. Adds to `metrics.jsonl` and replaces
+    `checkpoint.safetensors` at every report. `ValueError` when the folder holds a run of other
+    settings, or a batch cannot be divided.
     """
     folder = Path(folder)
-    state = _resume(folder, config)
-    step_fn = jax.jit(partial(train_step, config=config), donate_argnums=0)
-    metrics, start = [], time.perf_counter()
+    devices, processes = jax.device_count(), jax.process_count()
+    if config.batch % devices:
+        raise ValueError(
+            f"A batch of {config.batch} cannot be divided among {devices} devices; "
+            "give a multiple of their number."
+        )
+    mesh = jax.make_mesh((devices,), ("batch",))
+    whole, spread = NamedSharding(mesh, P()), NamedSharding(mesh, P("batch"))
+    share = partial(jax.make_array_from_process_local_data, whole)
+    state = jax.tree.map(share, _agreed_state(folder, config, start))
+    run = _identity(config, start)
+    step_fn = _parallel_step(config, mesh)
+    metrics, began = [], time.perf_counter()
     for step in range(int(state.step), config.steps):
-        state, outcome = step_fn(state, *batch_of(dataset, config, step))
+        batch = batch_of(dataset, config, step, (jax.process_index(), processes))
+        batch = [jax.make_array_from_process_local_data(spread, x) for x in batch]
+        state, outcome = step_fn(state, *batch)
         metrics.append(outcome)
         if (step + 1) % config.report_every == 0 or step + 1 == config.steps:
             loss, iou = np.mean(jax.device_get(metrics), axis=0)
-            seconds = time.perf_counter() - start
+            seconds = time.perf_counter() - began
             rate = config.batch * len(metrics) / seconds
             report = Report(step + 1, float(loss), float(iou), rate, seconds)
-            _record(folder, report)
-            save_checkpoint(folder, state, config)
+            if jax.process_index() == 0:
+                _record(folder, report)
+                save_checkpoint(folder, state, run)
             yield report
-            metrics, start = [], time.perf_counter()
+            metrics, began = [], time.perf_counter()
+
+
+def _parallel_step(config: TrainConfig, mesh: Mesh):
+    """`train_step` of a batch spread over the mesh, each device on its part."""
+    axis = "batch" if mesh.size > 1 else None  # XLA keeps collectives even over a single device
+    step = jax.shard_map(
+        partial(train_step, config=config, axis=axis),
+        mesh=mesh,
+        in_specs=(P(), P("batch"), P("batch")),
+        out_specs=P(),
+        check_vma=False,  # the convolutions' own derivatives do not say how they vary
+    )
+    return jax.jit(step, donate_argnums=0)
 
 
 def finished_prior(
     folder: str | os.PathLike[str], dataset: Dataset, config: TrainConfig, *, samples: int = 4096
 ) -> ShapePrior:
     """The shape prior of a finished run, with the statistics of the training set's codes."""
-    variables = _resume(Path(folder), config).variables
+    variables = _read_checkpoint(Path(folder) / "checkpoint.safetensors", config).variables
     many = replace(config, batch=64, seed=config.seed + 1)
     encode_batch = jax.jit(partial(encode, variables))
     steps = -(-min(samples, len(dataset.names)) // many.batch)
@@ -176,29 +248,46 @@ def finished_prior(
     return ShapePrior(variables, jnp.asarray(codes.mean(0)), jnp.asarray(covariance, jnp.float32))
 
 
-def save_checkpoint(folder: Path, state: TrainState, config: TrainConfig) -> None:
-    """Replace the checkpoint of a run, atomically."""
+def save_checkpoint(folder: Path, state: TrainState, run: str) -> None:
+    """Replace the checkpoint of a run, atomically; `run` tells it from others."""
     tensors = {name: np.asarray(x) for name, x in flatten(state).items()}
     with atomic_path(folder / "checkpoint.safetensors") as temporary:
-        save_file(tensors, temporary, {"config": json.dumps(asdict(config))})
+        save_file(tensors, temporary, {"run": run})
 
 
-def _resume(folder: Path, config: TrainConfig) -> TrainState:
-    """The state of the checkpoint, or the initial one where there is none."""
+def _identity(config: TrainConfig, start: ShapePrior | None) -> str:
+    """What a run must have in common with its checkpoint."""
+    return json.dumps(asdict(config) | {"start": start and fingerprint(start)})
+
+
+def _agreed_state(folder: Path, config: TrainConfig, start: ShapePrior | None) -> TrainState:
+    """The state of the checkpoint, or the initial one where there is none, for all processes.
+
+    The first looks, for the others may not see its disk; they refuse what it refuses.
+    """
+    share, is_first = multihost_utils.broadcast_one_to_all, jax.process_index() == 0
     path = folder / "checkpoint.safetensors"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        return initial_state(config)
+    is_there = is_first and path.exists()
+    if share(is_there and _run_of(path) != _identity(config, start)):
+        raise ValueError(
+            f"{str(folder)!r} holds a training run of other settings; "
+            "give the same ones to resume it, or another folder."
+        )
+    if is_first:
+        return share(_read_checkpoint(path, config) if is_there else initial_state(config, start))
+    shapes = jax.eval_shape(lambda: initial_state(config, start))
+    return share(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))
+
+
+def _run_of(checkpoint: Path) -> str | None:
+    with safe_open(checkpoint, "np") as file:
+        return (file.metadata() or {}).get("run")
+
+
+def _read_checkpoint(path: Path, config: TrainConfig) -> TrainState:
+    template = jax.eval_shape(lambda: initial_state(config))
     with safe_open(path, "np") as file:
-        stored = json.loads(file.metadata()["config"])
-        if stored != json.loads(json.dumps(asdict(config))):
-            raise ValueError(
-                f"{str(folder)!r} holds a training run of other settings; "
-                "give the same ones to resume it, or another folder."
-            )
-        template = jax.eval_shape(lambda: initial_state(config))
-        names = flatten(template)
-        leaves = [jnp.asarray(file.get_tensor(name)) for name in names]
+        leaves = [jnp.asarray(file.get_tensor(name)) for name in flatten(template)]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 

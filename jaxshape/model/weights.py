@@ -1,5 +1,6 @@
 """Trained auto-encoders on disk, as safetensors: no code is ever loaded. [host]"""
 
+import hashlib
 import json
 import os
 from importlib import resources
@@ -61,6 +62,15 @@ def load_prior(path: str | os.PathLike[str] | None = None) -> ShapePrior:
 def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
     """Read the model card of a weights file: data, command, seed, time, measured figures."""
     return json.loads(_read(_path(path))[1]["card"])
+
+
+def fingerprint(prior: ShapePrior) -> str:
+    """A hash of all numbers of a shape prior: the same for the same weights, wherever they lie."""
+    digest = hashlib.sha256()
+    for name, x in flatten(prior).items():
+        digest.update(name.encode())
+        digest.update(np.asarray(x).tobytes())
+    return digest.hexdigest()
 
 
 def flatten(tree: PyTree) -> dict[str, Any]:

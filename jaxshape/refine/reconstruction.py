@@ -135,6 +135,28 @@ def reconstruct_jit(refiner: Refiner | None, config: RefineConfig) -> Callable[.
     return jax.jit(partial(reconstruct, refiner=refiner, config=config))
 
 
+def fit_surface(
+    prior: ShapePrior, surface: Bool[Array, "object x y z"], *, iterations: int = 150
+) -> Bool[Array, "object x y z"]:
+    """The shapes of the space nearest to complete surfaces: the ceiling of any reconstruction.
+
+    Codes start where the encoder puts the complete surface and are fitted by Adam, in raw codes, to
+    the balanced cross-entropy with all of it.
+    """
+    config = RefineConfig(iterations=iterations, space="raw", tolerance=0.0)
+    nothing = jnp.zeros_like(surface)
+    found = refine(
+        jax.random.split(jax.random.key(0), len(surface)),  # Adam draws none
+        prior.params,
+        encode(prior.params, surface),
+        target(surface, nothing, jnp.zeros(surface.shape)),
+        refiner_for("gradient:adam", prior, config),
+        iterations,
+        space=search_space(prior, config),
+    )
+    return found.logits > 0
+
+
 def all_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> bool:
     """Whether every grid has an occupied voxel, something to rebuild from."""
     return bool(np.asarray(occupied).any(axis=(-3, -2, -1)).all())

@@ -1,6 +1,5 @@
 """Score refinement methods on meshes seen along an orbit (paper, section 4.1). [host]"""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,11 +16,12 @@ from jaxshape.data.dataset import hash_seed
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
-from jaxshape.model.weights import ShapePrior, flatten
+from jaxshape.model.weights import ShapePrior
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import (
     Reconstruction,
     all_measured,
+    fit_surface,
     reconstruct,
     refiner_for,
 )
@@ -41,6 +41,8 @@ class EvaluateConfig:
     """By name, see `jaxshape.refine.methods`; "encoder" searches nothing."""
     noise: bool = False
     """Add the faults of a real sensor to the depth images."""
+    ceiling: bool = False
+    """Add to the bounds the best that the space could hold, `fit_surface`, whatever was seen."""
     refine: RefineConfig = field(default_factory=RefineConfig)
     seed: int = 0
 
@@ -85,7 +87,7 @@ def evaluate(
     Meshes are refined in batches; the last batch is filled up with its own first cases so that
     one compiled program serves all.
     """
-    run = by_each_method(prior, config)
+    run, fit = by_each_method(prior, config), jax.jit(fit_surface)
     group = max(1, OBJECTS_AT_A_TIME // len(config.frames))
     size = min(group, len(models)) * len(config.frames)
     for start in range(0, len(models), group):
@@ -100,12 +102,19 @@ def evaluate(
         found = jax.device_get(run(keys, prior, filled.occupied, filled.occluded))
         found = {name: found[name] for name in config.methods}  # JAX has sorted the names
         cases = jax.device_get(cases)
+        ceilings = None
+        if config.ceiling:
+            surfaces = filled.surface[:: len(config.frames)]
+            ceilings = iou(fit(prior, surfaces), surfaces)
         for i, (model, _) in enumerate(seen):
             rows = range(i * len(config.frames), (i + 1) * len(config.frames))
             frames = {
                 str(k): _scores(jax.tree.map(lambda x, row=row: x[row], cases), found, row)
                 for k, row in zip(config.frames, rows, strict=True)
             }
+            if ceilings is not None:
+                for scores in frames.values():
+                    scores["bounds"]["ceiling"] = float(ceilings[i])
             yield {"name": model.name, "metadata": model.metadata, "frames": frames}
 
 
@@ -167,15 +176,6 @@ def summarize(per_mesh: Sequence[dict[str, Any]], config: EvaluateConfig) -> dic
         }
         for k in config.frames
     }
-
-
-def fingerprint(prior: ShapePrior) -> str:
-    """A hash of all numbers of a shape prior: the same for the same weights, wherever they lie."""
-    digest = hashlib.sha256()
-    for name, x in flatten(prior).items():
-        digest.update(name.encode())
-        digest.update(np.asarray(x).tobytes())
-    return digest.hexdigest()
 
 
 # A long evaluation keeps its scores in a journal beside the results file until that is written.

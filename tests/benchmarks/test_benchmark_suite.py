@@ -17,7 +17,7 @@ import jaxshape as js
 from benchmarks import NAMES, __main__, decode, fusion, harness
 from benchmarks.harness import Metric
 from benchmarks.rivals import numpy_fusion
-from jaxshape.model.autoencoder import Architecture
+from jaxshape.model.config import Architecture
 
 IMAGE = (48, 64)
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from jaxshape.model.autoencoder import (
-    Architecture,
     AutoEncoder,
     architecture_of,
     decode,
     encode,
     initialize,
 )
+from jaxshape.model.config import Architecture
 from jaxshape.model.weights import flatten
 
 TINY = Architecture((4, 4, 8, 8), (8, 8, 4), 10)
@@ -48,7 +48,7 @@ def trained(params, grids):
     def gradient(params, grids):
         def total(weights):
             variables = {**params, "params": weights}
-            logits, updates = AutoEncoder(TINY).apply(
+            (logits, _), updates = AutoEncoder(TINY).apply(
                 variables, grids, train=True, mutable=["batch_stats"]
             )
             return jnp.mean(jnp.sin(50 * logits + 1)), updates
@@ -126,6 +126,14 @@ def test_training_moves_the_batch_statistics_and_evaluation_does_not(params, tra
     evaluate = partial(AutoEncoder(TINY).apply, train=False, mutable=["batch_stats"])
     same = jax.jit(lambda params, grid: evaluate(params, grid)[1])(params, grids[0, :1])
     jax.tree.map(np.testing.assert_array_equal, same["batch_stats"], params["batch_stats"])
+
+
+def test_noise_is_added_to_the_code_and_reaches_the_grid_alone(params, grids, codes):
+    run = jax.jit(partial(AutoEncoder(TINY).apply, train=False))
+    logits, code = run(params, grids[0], noise=codes[0])
+    np.testing.assert_allclose(code[None], jax.jit(encode)(params, grids), atol=1e-6)
+    noisy = jax.jit(decode)(params, code[None] + codes)
+    np.testing.assert_allclose(logits[None], noisy, atol=1e-5)
 
 
 def test_sizes_are_read_off_the_parameters(params):

@@ -11,7 +11,8 @@ from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.dataset import TEST_SEEDS
 from jaxshape.geometry import camera, fusion
-from jaxshape.model.autoencoder import Architecture, architecture_of, decode, encode
+from jaxshape.model.autoencoder import architecture_of, decode, encode
+from jaxshape.model.config import Architecture
 from jaxshape.model.weights import load_card, load_prior
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import reconstruct, refiner_for

@@ -3,48 +3,34 @@ from dataclasses import replace
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+import tiny_training
+from tiny_training import CONFIG, OBJECTS
 
-from jaxshape.data.dataset import Dataset, pack, unpack
+from jaxshape.data.config import InputConfig
+from jaxshape.data.dataset import unpack
 from jaxshape.model import training
-from jaxshape.model.autoencoder import Architecture
-from jaxshape.model.training import TrainConfig, batch_of, initial_state, read_metrics, train_step
+from jaxshape.model.config import PRESETS, Architecture
+from jaxshape.model.training import TrainState, batch_of, initial_state, read_metrics, train_step
+from jaxshape.model.weights import load_prior
 
-OBJECTS, VIEWS = 7, 4
-CONFIG = TrainConfig(
-    Architecture((4, 4, 8, 8), (8, 8, 4), 10),
-    steps=5, batch=2, learning_rate=1e-2, max_views=3, report_every=2,
+CLEAN = replace(
+    CONFIG,
+    inputs=InputConfig(max_views=3, complete=0.0, mirror=False, scale=0.0, pose_error=0.0,
+                       missing=0.0, segmentation=0.0),
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def dataset():
-    """Random slabs, and views that each hold a random half of one."""
-    rng = np.random.default_rng(0)
-    surface = np.zeros((OBJECTS, 1, 32, 32, 32), bool)
-    for i in range(OBJECTS):
-        surface[i, 0, 4 * i : 4 * i + 6, 5:27, 5:27] = True
-    views = surface & (rng.random((OBJECTS, VIEWS, 32, 32, 32)) < 0.5)
-    packed = pack(np.concatenate([surface, views], axis=1))
-    names = [f"object {i}" for i in range(OBJECTS)]
-    return Dataset(names, [packed[:4], packed[4:]], [(i // 4, i % 4) for i in range(OBJECTS)])
-
-
-@pytest.fixture(scope="module")
-def whole_run(dataset, tmp_path_factory):
-    """The folder of a run that was not interrupted, and its first checkpoint."""
-    folder = tmp_path_factory.mktemp("run")
-    reports = training.train(folder, dataset, CONFIG)
-    first = next(reports)
-    checkpoint = (folder / "checkpoint.safetensors").read_bytes()
-    return folder, checkpoint, [first, *reports]
 
 
 def views_of(dataset, surface):
     """The packed views of the object with a complete surface."""
     index = next(i for i in range(OBJECTS) if np.array_equal(unpack(dataset.packed(i)[0]), surface))
     return index, unpack(dataset.packed(index)[1:])
+
+
+# ------------------------------------------------------------------ batches
 
 
 def test_a_batch_is_a_function_of_the_seed_and_the_step(dataset):
@@ -54,18 +40,27 @@ def test_a_batch_is_a_function_of_the_seed_and_the_step(dataset):
         assert (first[0] != other[0]).any()
 
 
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_batch_in_parts_is_the_whole_batch(dataset, count):
+    whole = batch_of(dataset, CONFIG, 3)  # over the end of an epoch: pairs 12 to 15 of 7 objects
+    parts = [batch_of(dataset, CONFIG, 3, (i, count)) for i in range(count)]
+    for grids, expected in zip(zip(*parts, strict=True), whole, strict=True):
+        assert all(len(grid) == CONFIG.batch // count for grid in grids)
+        np.testing.assert_array_equal(np.concatenate(grids), expected)
+
+
 def test_each_epoch_visits_each_object_once_in_an_order_of_its_own(dataset):
-    surfaces = np.concatenate([batch_of(dataset, CONFIG, step)[1] for step in range(OBJECTS)])
+    surfaces = np.concatenate([batch_of(dataset, CLEAN, step)[1] for step in range(OBJECTS)])
     visited = np.array([views_of(dataset, surface)[0] for surface in surfaces])
-    epochs = visited.reshape(2, OBJECTS)  # 7 batches of 2 are two epochs of 7
-    np.testing.assert_array_equal(np.sort(epochs), np.tile(np.arange(OBJECTS), (2, 1)))
-    assert (epochs[0] != epochs[1]).any()
+    epochs = visited.reshape(4, OBJECTS)  # 7 batches of 4 are four epochs of 7
+    np.testing.assert_array_equal(np.sort(epochs), np.tile(np.arange(OBJECTS), (4, 1)))
+    assert len({tuple(epoch) for epoch in epochs}) > 1
 
 
-def test_inputs_are_unions_of_one_to_the_most_views_of_the_object_itself(dataset):
+def test_clean_inputs_are_unions_of_one_to_the_most_views_of_the_object_itself(dataset):
     counts = set()
-    for step in range(20):
-        for measured, surface in zip(*batch_of(dataset, CONFIG, step), strict=True):
+    for step in range(10):
+        for measured, surface in zip(*batch_of(dataset, CLEAN, step), strict=True):
             views = views_of(dataset, surface)[1]
             chosen = [view for view in views if not (view & ~measured).any()]
             np.testing.assert_array_equal(np.any(chosen, axis=0), measured)
@@ -73,14 +68,85 @@ def test_inputs_are_unions_of_one_to_the_most_views_of_the_object_itself(dataset
     assert counts == {1, 2, 3}
 
 
-def test_more_views_than_there_are_means_all_of_them(dataset):
-    measured, _ = batch_of(dataset, replace(CONFIG, max_views=99, batch=OBJECTS), 0)
-    assert measured.any(axis=(1, 2, 3)).all()
+# ------------------------------------------------------------------ one step
 
 
-def losses_on_one_batch(dataset, config, count):
-    step = jax.jit(partial(train_step, config=config))
-    state, batch = initial_state(config), batch_of(dataset, config, 0)
+class FixedNetwork:
+    """In place of the network: the logits and the code that its parameters say, for every grid."""
+
+    def __init__(self, *_):
+        pass
+
+    def apply(self, variables, measured, *, noise, **_):
+        params = variables["params"]
+        code = jnp.broadcast_to(params["code"], (len(measured), *params["code"].shape))
+        logits = jnp.broadcast_to(params["logit"], measured.shape) + 0 * jnp.sum(noise)
+        return (logits, code), {}
+
+
+LOGIT, CODE = 0.7, np.array([1.0, -2.0, 3.0], np.float32)
+
+
+@pytest.fixture
+def first_step(monkeypatch):
+    """The step of a fixed network on grids of which an eighth is occupied."""
+    monkeypatch.setattr(training, "AutoEncoder", FixedNetwork)
+    surface = np.zeros((2, 32, 32, 32), bool)
+    surface[:, :16, :16, :16] = True
+    params = {"logit": jnp.float32(LOGIT), "code": jnp.asarray(CODE)}
+
+    def step(**settings):
+        config = replace(CONFIG, **{"code_weight": 0.0} | settings)
+        optimizer = training.optimizer_for(config).init(params)
+        state = TrainState(jnp.zeros((), jnp.int32), {"params": params}, optimizer)
+        state, (loss, iou) = jax.jit(partial(train_step, config=config))(state, surface, surface)
+        return float(loss), float(iou), state.variables["params"]
+
+    return step
+
+
+def test_the_loss_weighs_occupied_voxels(first_step):
+    for weight in (1.0, 1.5):
+        loss, iou, _ = first_step(occupied_weight=weight)
+        occupied, free = np.log1p(np.exp(-LOGIT)), np.log1p(np.exp(LOGIT))
+        np.testing.assert_allclose(loss, weight * occupied / 8 + free * 7 / 8, rtol=1e-5)
+        np.testing.assert_allclose(iou, 1 / 8)  # everything is completed
+
+
+def test_the_weight_of_codes_adds_half_their_squared_length_a_voxel(first_step):
+    plain, _, unmoved = first_step()
+    np.testing.assert_array_equal(unmoved["code"], CODE)
+    weighted, _, moved = first_step(code_weight=100.0)
+    np.testing.assert_allclose(weighted - plain, 100 * 0.5 * np.sum(CODE**2) / 32**3, rtol=1e-4)
+    assert (np.abs(moved["code"]) < np.abs(CODE)).all()
+
+
+def test_muon_orthogonalizes_the_moves_of_kernels_and_leaves_the_rest_to_adam():
+    config = replace(CONFIG, optimizer="muon", schedule="constant", learning_rate=0.01)
+    rng = np.random.default_rng(0)
+    params = {"kernel": jnp.zeros((5, 5, 5, 2, 6)), "bias": jnp.zeros(6)}
+    gradients = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), params)
+    optimizer = training.optimizer_for(config)
+    moves, _ = jax.jit(optimizer.update)(gradients, optimizer.init(params), params)
+    values = np.linalg.svd(np.reshape(moves["kernel"], (-1, 6)), compute_uv=False)
+    assert values.max() < 1.8 * values.min()  # Newton-Schulz leaves them between 0.7 and 1.2
+    adam = optax.adam(0.01, nesterov=True)
+    expected, _ = adam.update(gradients["bias"], adam.init(params["bias"]))
+    np.testing.assert_allclose(moves["bias"], expected, rtol=1e-3)
+
+
+def test_the_cosine_schedule_warms_up_and_ends_with_steps_of_nothing():
+    optimizer = training.optimizer_for(replace(CONFIG, schedule="cosine", steps=20))
+    gradient, state, moves = jnp.ones(3), optimizer.init(jnp.zeros(3)), []
+    for _ in range(21):
+        move, state = optimizer.update(gradient, state)
+        moves.append(-float(move[0]))
+    np.testing.assert_allclose(max(moves), CONFIG.learning_rate, rtol=1e-4)
+    np.testing.assert_allclose([moves[0], moves[-1]], 0, atol=1e-9)
+    assert np.argmax(moves) == 2 and (np.diff(moves[2:]) < 0).all()
+
+
+def losses_on_one_batch(step, state, batch, count):
     losses = []
     for _ in range(count):
         state, (loss, _) = step(state, *batch)
@@ -90,54 +156,92 @@ def losses_on_one_batch(dataset, config, count):
     return np.array(losses)
 
 
-def test_the_loss_falls_on_one_batch(dataset):
-    losses = losses_on_one_batch(dataset, replace(CONFIG, steps=100), 15)
-    np.testing.assert_allclose(losses[0], np.log(2), atol=0.02)  # every voxel undecided
-    assert losses[-1] < 0.8 * losses[0]
+def test_the_loss_falls_on_one_batch(dataset, whole_run, start):
+    state = initial_state(CONFIG, load_prior(start))
+    batch = jax.device_put(batch_of(dataset, CONFIG, 0))
+    losses = losses_on_one_batch(whole_run.programs[0], state, batch, 60)
+    assert losses[-5:].mean() < 0.9 * losses[:5].mean()
 
 
 @pytest.mark.slow
 def test_training_in_bfloat16_follows_that_in_float32(dataset):
-    config = replace(CONFIG, steps=100)
-    losses = losses_on_one_batch(dataset, config, 4)
-    halved = losses_on_one_batch(dataset, replace(config, bfloat16=True), 4)
-    assert (halved != losses).any()
-    np.testing.assert_allclose(halved, losses, rtol=0.03)
+    def losses(config):
+        step = jax.jit(partial(train_step, config=config))
+        return losses_on_one_batch(step, initial_state(config), batch_of(dataset, config, 0), 4)
+
+    config = replace(CLEAN, learning_rate=1e-2, occupied_weight=1.0)
+    full, halved = losses(config), losses(replace(config, bfloat16=True))
+    assert (halved != full).any()
+    np.testing.assert_allclose(halved, full, rtol=0.03)
 
 
-def test_a_killed_and_resumed_run_equals_an_unbroken_one_bit_for_bit(dataset, whole_run, tmp_path):
+# ------------------------------------------------------------------ a run
+
+
+def test_a_killed_and_resumed_run_equals_an_unbroken_one_bit_for_bit(
+    dataset, whole_run, start, tmp_path, monkeypatch
+):
     """The kill falls after metrics were written for steps that are then repeated."""
-    folder, first_checkpoint, reports = whole_run
-    assert [r.step for r in reports] == [2, 4, 5]
-    shutil.copy(folder / "metrics.jsonl", tmp_path)
-    (tmp_path / "checkpoint.safetensors").write_bytes(first_checkpoint)
-    resumed = list(training.train(tmp_path, dataset, CONFIG))
+    assert [r.step for r in whole_run.reports] == [2, 4, 5]
+    tiny_training.make_quick(monkeypatch.setattr, whole_run.programs)
+    shutil.copy(whole_run.folder / "metrics.jsonl", tmp_path)
+    (tmp_path / "checkpoint.safetensors").write_bytes(whole_run.first_checkpoint)
+    resumed = list(training.train(tmp_path, dataset, CONFIG, load_prior(start)))
     assert [(r.step, r.loss, r.iou) for r in resumed] == [
-        (r.step, r.loss, r.iou) for r in reports[1:]
+        (r.step, r.loss, r.iou) for r in whole_run.reports[1:]
     ]
     assert [r.step for r in read_metrics(tmp_path)] == [2, 4, 5]
-    last = (folder / "checkpoint.safetensors").read_bytes()
-    assert (tmp_path / "checkpoint.safetensors").read_bytes() == last != first_checkpoint
+    last = (whole_run.folder / "checkpoint.safetensors").read_bytes()
+    assert (tmp_path / "checkpoint.safetensors").read_bytes() == last
+    assert last != whole_run.first_checkpoint
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "muon"])
+def test_a_checkpoint_holds_the_whole_state(optimizer, start, tmp_path):
+    config = replace(CONFIG, optimizer=optimizer)
+    state = initial_state(config, load_prior(start))
+    state = jax.tree.map(lambda x: np.asarray(x) + np.ones((), x.dtype), state)
+    training.save_checkpoint(tmp_path, state, "a run")
+    again = training._read_checkpoint(tmp_path / "checkpoint.safetensors", config)
+    jax.tree.map(np.testing.assert_array_equal, again, state)
 
 
 def test_metrics_on_disk_are_the_reports(whole_run, tmp_path):
-    assert read_metrics(whole_run[0]) == whole_run[2]
+    assert read_metrics(whole_run.folder) == whole_run.reports
     assert read_metrics(tmp_path) == []
 
 
-def test_a_finished_run_has_nothing_left_to_do(dataset, whole_run):
-    before = (whole_run[0] / "checkpoint.safetensors").read_bytes()
-    assert list(training.train(whole_run[0], dataset, CONFIG)) == []
-    assert (whole_run[0] / "checkpoint.safetensors").read_bytes() == before
+def test_a_finished_run_has_nothing_left_to_do(dataset, whole_run, start):
+    before = (whole_run.folder / "checkpoint.safetensors").read_bytes()
+    assert list(training.train(whole_run.folder, dataset, CONFIG, load_prior(start))) == []
+    assert (whole_run.folder / "checkpoint.safetensors").read_bytes() == before
 
 
-def test_a_run_of_other_settings_is_refused(dataset, whole_run):
-    with pytest.raises(ValueError, match="training run of other settings"):
-        next(training.train(whole_run[0], dataset, replace(CONFIG, learning_rate=1e-3)))
+def test_a_run_of_other_settings_or_another_start_is_refused(dataset, whole_run, start):
+    prior = load_prior(start)
+    other = prior._replace(code_mean=prior.code_mean + 1)
+    for config, begin in ((replace(CONFIG, seed=1), prior), (CONFIG, None), (CONFIG, other)):
+        with pytest.raises(ValueError, match="training run of other settings"):
+            next(training.train(whole_run.folder, dataset, config, begin))
 
 
-def test_the_prior_describes_the_codes_of_the_training_set(dataset, whole_run):
-    prior = training.finished_prior(whole_run[0], dataset, CONFIG)
+def test_a_run_starts_with_a_copy_of_the_weights_it_is_given(start):
+    prior = load_prior(start)
+    state = initial_state(CONFIG, prior)
+    jax.tree.map(np.testing.assert_array_equal, state.variables, prior.params)
+    jax.tree.map(lambda x: x.delete(), state.variables)
+    assert not any(x.is_deleted() for x in jax.tree.leaves(prior.params))
+
+
+def test_weights_of_other_sizes_are_no_start(start):
+    wider = replace(CONFIG, architecture=Architecture((4, 4, 8, 8), (8, 8, 4), 12))
+    with pytest.raises(ValueError, match=r"start from are of .*code=10.*the run of .*code=12"):
+        initial_state(wider, load_prior(start))
+
+
+def test_the_prior_describes_the_codes_of_the_training_set(dataset, whole_run, monkeypatch):
+    tiny_training.make_quick(monkeypatch.setattr, whole_run.programs)
+    prior = whole_run.prior
     inputs, _ = batch_of(dataset, replace(CONFIG, batch=64, seed=CONFIG.seed + 1), 0)
     codes = np.asarray(jax.jit(training.encode)(prior.params, inputs))
     np.testing.assert_allclose(prior.code_mean, codes.mean(axis=0), atol=1e-5)
@@ -147,3 +251,13 @@ def test_the_prior_describes_the_codes_of_the_training_set(dataset, whole_run):
         covariance, np.cov(codes, rowvar=False), atol=2e-3 * np.trace(covariance)
     )
     assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_the_paper_preset_is_the_paper(dataset):
+    """Sections 2.2 and 2.3: single views as they are, the plain loss, Adam at 1e-4."""
+    paper = PRESETS["paper"]
+    assert (paper.optimizer, paper.learning_rate, paper.schedule) == ("adam", 1e-4, "constant")
+    assert (paper.occupied_weight, paper.code_noise, paper.code_weight) == (1, 0, 0)
+    assert paper.architecture == Architecture((32, 64, 128, 256), (256, 128, 64), 100)
+    for measured, surface in zip(*batch_of(dataset, replace(paper, batch=8), 0), strict=True):
+        assert any(np.array_equal(measured, view) for view in views_of(dataset, surface)[1])

@@ -8,11 +8,13 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from jaxshape.model import weights
-from jaxshape.model.autoencoder import Architecture, initialize
+from jaxshape.model.autoencoder import initialize
+from jaxshape.model.config import Architecture
 from jaxshape.model.weights import (
     FORMAT,
     ShapePrior,
     WeightsError,
+    fingerprint,
     load_card,
     load_prior,
     save_prior,
@@ -154,3 +156,10 @@ def test_a_kill_during_saving_leaves_the_former_file(prior, tmp_path, monkeypatc
     assert os.listdir(tmp_path) == ["prior.safetensors"]
     assert load_card(path) == CARD
     np.testing.assert_array_equal(load_prior(path).code_mean, prior.code_mean)
+
+
+def test_weights_are_known_by_their_numbers(prior):
+    copy = jax.tree.map(lambda x: x + 0, prior)
+    assert fingerprint(copy) == fingerprint(prior)
+    changed = prior._replace(code_mean=prior.code_mean.at[3].set(1e-6))
+    assert fingerprint(changed) != fingerprint(prior)

@@ -14,6 +14,7 @@ from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.objective import cross_entropy, target
 from jaxshape.refine.reconstruction import (
     compose,
+    fit_surface,
     reconstruct_jit,
     refiner_for,
     require_measured,
@@ -21,6 +22,7 @@ from jaxshape.refine.reconstruction import (
     unlikeliness,
 )
 from jaxshape.refine.refiner import StopReason
+from jaxshape.results.metrics import iou
 
 KEY = jax.random.key(0)
 KEYS = jax.random.split(KEY, 2)
@@ -195,3 +197,11 @@ def test_nothing_measured_is_said_in_a_sentence():
         require_measured(OCCUPIED.at[1].set(False))
     with pytest.raises(ValueError, match="Nothing was measured"):
         require_measured(jnp.zeros((4, 4, 4), bool))
+
+
+def test_a_surface_that_the_space_holds_is_found_from_any_code(linear_prior, monkeypatch):
+    codes = 3 * jax.random.normal(jax.random.key(6), (2, 10))
+    surface = reconstruction.decode(linear_prior.params, codes) > 0
+    monkeypatch.setattr(reconstruction, "encode", lambda params, grid: jnp.zeros((2, 10)))
+    fitted = jax.jit(fit_surface)(linear_prior, surface)
+    assert (iou(fitted, surface) > 0.8).all()

@@ -8,8 +8,8 @@ from jaxshape.data.chairs.primitives import Part, bars, bend, both_sides, box, c
 from jaxshape.data.chairs.seats import Seat
 
 HUNG_ARMS = {"loop": 0.45, "pads": 0.3, "panel": 0.15, "wrap": 0.1}  # none reaches the floor
-FRAMED_ARMS = {"posts": 0.35, "loop": 0.25, "panel": 0.1, "wrap": 0.15, "pads": 0.1,
-               "floor loop": 0.05, "side": 0.03}  # fmt: skip
+FRAMED_ARMS = {"posts": 0.35, "loop": 0.2, "panel": 0.16, "wrap": 0.14, "pads": 0.08,
+               "floor loop": 0.05, "side": 0.05}  # fmt: skip
 
 
 def arm_parts(draw: Draw, seat: Seat, rest: Rest, options: Weights) -> list[Part]:
@@ -22,7 +22,7 @@ def _posts(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
     x, front = seat.width / 2 + draw.between(-0.02, 0.03), seat.depth / 2 - draw.between(0, 0.18)
     share = min((y - rest.y) / rest.height, 1.0)
     back = rest.at(1.0, share)
-    width, thick = draw.between(0.02, 0.07), draw.between(0.015, 0.035)
+    width, thick = draw.between(0.02, 0.09), draw.between(0.015, 0.04)
     sweep = draw.between(-0.03, 0.05)
     t = np.linspace(0, 1, 5)[:, None]
     tip = np.array([x + sweep, y, front + draw.between(0.0, 0.06)])
@@ -73,7 +73,7 @@ def _floor_loop(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
 
 def _panel(draw: Draw, seat: Seat, rest: Rest, y: Number, low: Number | None = None) -> list[Part]:
     """A solid side, from just under the seat or from the height `low`."""
-    thick = draw.between(0.02, 0.07)
+    thick = draw.between(0.02, 0.12)
     x, length = seat.width / 2 + thick / 2 - 0.01, seat.depth * draw.between(0.75, 1.0)
     low = seat.height - draw.between(0.02, 0.12) if low is None else low
     drop = draw.between(0, 0.12) if draw.chance(0.5) else 0.0
@@ -125,9 +125,16 @@ def tray(draw: Draw, seat: Seat) -> list[Part]:
     """The tray of a high chair or the tablet of a lecture chair, on its brackets."""
     y = seat.height + draw.between(0.17, 0.25)
     z, x = seat.depth / 2 + draw.between(-0.05, 0.08), seat.width / 2 + 0.02
-    size = (seat.width * draw.between(0.95, 1.3), draw.between(0.015, 0.03), draw.between(0.2, 0.3))
-    brackets = both_sides(bars((x, y, z), (x, seat.height - 0.02, -0.05), 0.02))
-    return [box((0, y, z), size), brackets]
+    bracket = bars((x, y, z), (x, seat.height - 0.02, -0.05), 0.02)
+    thick, deep = draw.between(0.015, 0.03), draw.between(0.2, 0.3)
+    if draw.chance(0.35):
+        side = 1 if draw.chance(0.6) else -1
+        wide = seat.width * draw.between(0.55, 0.9)
+        inward = draw.between(0.1, 0.4) * wide
+        board = box((x - inward, y, z), (wide, thick, deep * draw.between(1.0, 1.5)))
+        return [part._replace(vertices=part.vertices * (side, 1, 1)) for part in (board, bracket)]
+    board = box((0, y, z), (seat.width * draw.between(0.95, 1.3), thick, deep))
+    return [board, both_sides(bracket)]
 
 
 _ARMS = {

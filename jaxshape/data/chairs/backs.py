@@ -31,7 +31,7 @@ class Rest(NamedTuple):
         return np.stack(np.broadcast_arrays(x, y, z), -1)
 
 
-def draw_rest(draw: Draw, seat: Seat, height: Range = (0.33, 0.58)) -> Rest:
+def draw_rest(draw: Draw, seat: Seat, height: Range = (0.34, 0.64)) -> Rest:
     """A rest that stands on the back edge of the seat."""
     z = -seat.depth / 2 + draw.between(0.0, 0.03)
     back = seat.half_width(z) * (1.0 if seat.exponent > 2.5 else 0.75)
@@ -43,7 +43,7 @@ def draw_rest(draw: Draw, seat: Seat, height: Range = (0.33, 0.58)) -> Rest:
         height=tall,
         half_bottom=bottom,
         half_top=bottom * (1.0 if draw.chance(0.4) else draw.between(0.8, 1.2)),
-        lean=tall * (draw.between(0.0, 0.08) if draw.chance(0.4) else draw.between(0.08, 0.4)),
+        lean=tall * (draw.between(0.0, 0.08) if draw.chance(0.5) else draw.between(0.06, 0.28)),
         bow=0.0 if draw.chance(0.6) else draw.between(-0.03, 0.03),
         curve=0.0 if draw.chance(0.4) else draw.between(0.01, 0.09),
     )
@@ -93,7 +93,7 @@ def _solid(draw: Draw, rest: Rest) -> list[Part]:
 
 
 def _board_or_pad(draw: Draw) -> float:
-    return draw.thick(0.005, 0.025) if draw.chance(0.6) else draw.between(0.03, 0.09)
+    return draw.thick(0.005, 0.028) if draw.chance(0.5) else draw.between(0.03, 0.12)
 
 
 def _panel(draw: Draw, rest: Rest) -> list[Part]:

@@ -40,8 +40,8 @@ def place_legs(draw: Draw, seat: Seat, splay: Number, inset: float) -> Legs:
     feet = tops * (1, 0, 1)
     spread = np.array([draw.between(0.3, 1.0), 0, draw.between(0.3, 1.0)]) * splay
     feet = feet + np.sign(tops) * spread
-    if draw.chance(0.3):
-        feet[2:, 2] -= draw.between(0.0, 0.1)  # back legs raked backward
+    if draw.chance(0.6):
+        feet[2:, 2] -= draw.between(0.0, 0.14)  # back legs raked backward
     return Legs(tops, feet)
 
 
@@ -51,7 +51,7 @@ def _four_legs(draw: Draw, seat: Seat) -> list[Part]:
     inset = draw.between(0.005, 0.025) if flush else draw.between(0.015, 0.05)
     legs = place_legs(draw, seat, splay * seat.height / 0.45, inset)
     kind = draw.named("legs", {"square": 0.36, "tapered": 0.22, "round": 0.18, "turned": 0.06,
-                               "conical": 0.08, "bent": 0.07, "stout": 0.03})  # fmt: skip
+                               "conical": 0.08, "bent": 0.07, "stout": 0.06})  # fmt: skip
     thick = draw.thick(0.02, 0.045)
     if kind == "square":
         parts = [bars(legs.tops, legs.feet, thick, thick * draw.between(0.7, 1.4))]
@@ -70,7 +70,7 @@ def _four_legs(draw: Draw, seat: Seat) -> list[Part]:
         parts = [bars(legs.tops, legs.feet, draw.between(0.05, 0.09), sides=10, profile=profile)]
     else:
         parts = [_bent_legs(draw, legs, thick)]
-    likely = 0.45 if seat.height < 0.55 else 0.9
+    likely = 0.3 if seat.height < 0.55 else 0.85
     return parts + (stretchers(draw, legs, thick) if draw.chance(likely) else [])
 
 

@@ -25,7 +25,7 @@ def _framed(
     seats: Weights = FRAMED_SEATS,
     backs: Weights | None = FRAMED_BACKS,
     arms: Weights | None = None,
-    back_height: Range = (0.33, 0.58),
+    back_height: Range = (0.34, 0.64),
 ) -> list[Part]:
     """A chair of separate parts: a seat on a base, with a back and arms if any are given."""
     base = draw.pick(bases)
@@ -69,7 +69,7 @@ def _shell(draw: Draw) -> list[Part]:
     seat = draw_seat(draw, width=(0.38, 0.5), depth=(0.38, 0.46), round_chance=0)
     base = {"four legs": 0.45, "sled": 0.18, "disc": 0.1, "star": 0.1, "hairpin": 0.05,
             "loops": 0.07, "cantilever": 0.05}  # fmt: skip
-    narrow = seat._replace(width=seat.width * 0.85, depth=seat.depth * 0.85)
+    narrow = seat._replace(width=seat.width * 0.88, depth=seat.depth * 0.92)
     return shells.shell_parts(draw, seat) + base_parts(draw, narrow, base)
 
 
@@ -132,7 +132,7 @@ def _bar_stool(draw: Draw) -> list[Part]:
                      round_chance=0.5)  # fmt: skip
     bases = {"four legs": 0.45, "ringed legs": 0.2, "bar pedestal": 0.25, "sled": 0.06,
              "star": 0.04}  # fmt: skip
-    kind = draw.pick({"bare": 0.4, "back": 0.3, "shell": 0.15, "tub": 0.15})
+    kind = draw.pick({"bare": 0.25, "back": 0.45, "shell": 0.15, "tub": 0.15})
     if kind == "shell":
         low = seat._replace(depth=min(seat.depth, 0.4))
         return shells.shell_parts(draw, low, (0.08, 0.4)) + base_parts(draw, seat, bases)
@@ -222,15 +222,20 @@ def _recliner(draw: Draw) -> list[Part]:
 
 
 def _high_chair(draw: Draw) -> list[Part]:
-    """A child's high chair with a tray, or a lecture chair with a tablet."""
+    """A child's high chair with a tray, or a lecture chair with a tablet at one side."""
     seat = draw_seat(draw, width=(0.3, 0.42), depth=(0.28, 0.4), height=(0.5, 0.65), round_chance=0)
     parts = _framed(draw, seat, bases={"four legs": 0.7, "scissors": 0.3}, backs=PADDED_BACKS,
                     back_height=(0.3, 0.5))  # fmt: skip
     return parts + tray(draw, seat)
 
 
+def _slipper(draw: Draw) -> list[Part]:
+    """An upholstered seat and back without arms, on legs."""
+    return upholstery.slipper_parts(draw, draw.between(0.42, 0.85))
+
+
 def _club(draw: Draw) -> list[Part]:
-    return upholstery.club_parts(draw, draw.between(0.7, 1.12))
+    return upholstery.club_parts(draw, draw.between(0.56, 1.1))
 
 
 def _wing(draw: Draw) -> list[Part]:
@@ -291,16 +296,16 @@ def _wheels(draw: Draw, seat: Seat) -> list[Part]:
 
 
 _FAMILY: dict[str, tuple[float, Callable[[Draw], list[Part]]]] = {
-    "side chair": (0.20, _side_chair),
+    "side chair": (0.24, _side_chair),
     "armchair": (0.08, _armchair),
-    "shell": (0.09, _shell),
+    "shell": (0.08, _shell),
     "sled": (0.03, _sled),
-    "cantilever": (0.05, _cantilever),
+    "cantilever": (0.045, _cantilever),
     "pedestal": (0.05, _pedestal),
     "tub": (0.03, _tub),
-    "office": (0.07, _office),
-    "stool": (0.055, _stool),
-    "bar stool": (0.08, _bar_stool),
+    "office": (0.06, _office),
+    "stool": (0.035, _stool),
+    "bar stool": (0.065, _bar_stool),
     "bench": (0.015, _bench),
     "rocking": (0.02, _rocking),
     "folding": (0.035, _folding),
@@ -308,12 +313,13 @@ _FAMILY: dict[str, tuple[float, Callable[[Draw], list[Part]]]] = {
     "high chair": (0.02, _high_chair),
     "easy chair": (0.04, _easy_chair),
     "recliner": (0.035, _recliner),
-    "lounge": (0.055, _lounge),
+    "lounge": (0.045, _lounge),
     "floor chair": (0.01, _floor_chair),
     "wheelchair": (0.01, _wheelchair),
-    "club": (0.05, _club),
+    "slipper": (0.075, _slipper),
+    "club": (0.08, _club),
     "wing": (0.02, _wing),
-    "sofa": (0.02, _sofa),
+    "sofa": (0.025, _sofa),
     "barrel": (0.035, _barrel),
     "egg": (0.025, _egg),
     "pouffe": (0.01, _pouffe),
@@ -325,7 +331,7 @@ FREQUENCIES: Weights = {
 STYLES: tuple[str, ...] = tuple(FREQUENCIES)
 VOLUMINOUS: frozenset[str] = frozenset({"club", "wing", "sofa", "barrel", "egg", "pouffe"})
 CHILD_SHARE = 0.04
-STOUT_SHARE = 0.2
+STOUT_SHARE = 0.3
 
 
 def random_chair(seed: int | np.integer, *, style: str | None = None) -> trimesh.Trimesh:
@@ -342,7 +348,7 @@ def random_chair(seed: int | np.integer, *, style: str | None = None) -> trimesh
     drawn_style = draw.pick(FREQUENCIES)
     style = drawn_style if style is None else style
     if draw.chance(STOUT_SHARE):
-        draw.stoutness = draw.between(0.6, 2.6)
+        draw.stoutness = draw.between(0.7, 2.6)
     mesh = assemble(_FAMILY[style][1](draw))
     if draw.chance(CHILD_SHARE):
         mesh.apply_scale(draw.between(0.55, 0.8))

@@ -36,7 +36,7 @@ def draw_seat(
     draw: Draw,
     *,
     width: Range = (0.38, 0.52),
-    depth: Range = (0.37, 0.5),
+    depth: Range = (0.35, 0.49),
     height: Range = (0.42, 0.48),
     round_chance: Number = 0.12,
 ) -> Seat:
@@ -52,7 +52,7 @@ def draw_seat(
         width=seat_width,
         depth=seat_depth,
         height=draw.between(*height),
-        thickness=draw.thick(0.006, 0.022) if draw.chance(0.3) else draw.thick(0.02, 0.045),
+        thickness=draw.thick(0.006, 0.022) if draw.chance(0.25) else draw.thick(0.02, 0.06),
         exponent=exponent,
         taper=0.0 if is_round or draw.chance(0.5) else draw.between(0.02, 0.22),
     )
@@ -177,5 +177,5 @@ _SEATS = {
     "sling": _sling,
 }
 
-FRAMED_SEATS = {"board": 0.33, "dished": 0.14, "pad": 0.32, "block": 0.1, "slats": 0.1,
+FRAMED_SEATS = {"board": 0.32, "dished": 0.13, "pad": 0.3, "block": 0.16, "slats": 0.08,
                 "sling": 0.01}  # fmt: skip

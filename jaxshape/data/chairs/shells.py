@@ -60,7 +60,7 @@ def swept(
 def shell_parts(draw: Draw, seat: Seat, height: Range = (0.3, 0.5)) -> list[Part]:
     """A shell chair's surface: seat and back bent from one sheet, flat, dished or armed."""
     depth, tall = seat.depth, draw.between(*height)
-    lean = tall * draw.between(0.08, 0.4)
+    lean = tall * draw.between(0.05, 0.35)
     lip, rear = draw.between(-0.03, 0.03), draw.between(-0.02, 0.03)
     kind = draw.named("shell", {"flat": 0.35, "dished": 0.35, "bucket": 0.3})
     corners = [(depth / 2, seat.height - lip), (depth * 0.3, seat.height),
@@ -166,6 +166,8 @@ def tub(
     `bottom` is the size of the underside, at height `low`, over that of the seat.
     """
     outline = superellipse(draw.between(2.0, 6.0), 32)
+    if draw.chance(0.3):  # round behind, square in front
+        outline = np.where(outline[:, 1:] > 0, superellipse(draw.between(5.0, 14.0), 32), outline)
     around = np.arctan2(outline[:, 0], -outline[:, 1])  # 0 at the back, pi at the front
     back, level = draw.between(*tall), draw.between(0.3, 1.0)
     opening = np.radians(draw.between(85, 150))

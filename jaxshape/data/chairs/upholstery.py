@@ -38,12 +38,13 @@ def feet(draw: Draw, width: Number, depth: float, height: float) -> list[Part]:
 
 def club_parts(draw: Draw, width: Number, *, wings: bool = False) -> list[Part]:
     """A stuffed body between two arms, with loose cushions; `width` makes it a chair or a sofa."""
-    depth = draw.between(0.72, 0.98)
-    low = draw.between(0.0, 0.2) if draw.chance(0.75) else 0.0
-    seat, tall = draw.between(0.36, 0.48), draw.between(0.68, 0.95) + 0.18 * wings
-    arm = draw.between(0.1, 0.26)
+    depth = draw.between(0.56, 0.98)
+    low = draw.between(0.0, 0.3) if draw.chance(0.75) else 0.0
+    seat = max(draw.between(0.36, 0.48), low + 0.12)
+    tall = draw.between(0.68, 1.0) + 0.18 * wings
+    arm = draw.between(0.07, 0.25) * min(width, 1.0)
     arm_top = min(seat + draw.between(0.08, 0.26), tall)
-    back = draw.between(0.12, 0.26)
+    back = draw.between(0.12, 0.27) * depth
     inner = width - 2 * arm
     pad = min(draw.between(0.08, 0.18), seat - low - 0.08) if draw.chance(0.55) else 0.0
     edge = draw.between(0.03, 0.3)
@@ -56,8 +57,26 @@ def club_parts(draw: Draw, width: Number, *, wings: bool = False) -> list[Part]:
     parts.append(_seat_and_back(inner / 2 + over, (low, body_top, tall), (-depth / 2, back, front),
                                 lean * (tall - seat), edge))  # fmt: skip
     parts += _cushions(draw, inner, (-depth / 2 + back, front + 0.02), seat, pad, tall, lean)
+    if width < 1.2 and pad and draw.chance(0.08):
+        parts.append(_foot_rest(draw, inner, depth / 2, (low, body_top)))
     if wings:
         parts.append(_wings(draw, inner / 2 + arm * 0.3, arm_top, tall, depth, back))
+    return parts
+
+
+def slipper_parts(draw: Draw, width: Number) -> list[Part]:
+    """A stuffed seat and back in one, on short or long legs, with a loose seat cushion or none."""
+    depth, back = draw.between(0.5, 0.85), draw.between(0.07, 0.24)
+    low = draw.between(0.0, 0.36) if draw.chance(0.9) else 0.0
+    seat, tall = max(draw.between(0.36, 0.48), low + 0.06), draw.between(0.68, 1.1)
+    pad = min(draw.between(0.05, 0.14), seat - low - 0.04) if draw.chance(0.4) else 0.0
+    lean = draw.between(0.0, 0.3) * (tall - seat) if draw.chance(0.7) else 0.0
+    levels, places = (low, seat - pad, tall), (-depth / 2, back, depth / 2)
+    body = _seat_and_back(width / 2, levels, places, lean, draw.between(0.03, 0.3))
+    parts = [*feet(draw, width, depth, low), body]
+    if pad:
+        center = (0, seat - pad / 2, back / 2)
+        parts.append(cushion(center, (width, pad, depth - back), edge=draw.between(0.1, 0.45)))
     return parts
 
 
@@ -139,6 +158,16 @@ def _cushions(
         up = tilt(pillow, np.pi / 2 + 0.4, (0, 0, 0))
         parts.append(shift(up, (draw.between(-0.3, 0.3) * inner, seat + size / 2, back + 0.2)))
     return parts
+
+
+def _foot_rest(draw: Draw, width: Number, front: float, span: Range) -> Part:
+    """The pad that a recliner has swung out in front, level or hanging."""
+    long, thick = draw.between(0.25, 0.45), draw.between(0.05, 0.12)
+    flat = cushion((0, 0, 0), (width, thick, long), edge=draw.between(0.1, 0.4))
+    y, hang = span[0] + (span[1] - span[0]) * draw.between(0.4, 1.0), draw.between(0.0, 0.5)
+    above_floor = max(y - thick / 2, thick / 2 + long * np.sin(hang))
+    turned = tilt(flat, -hang, (0, 0, -long / 2))
+    return shift(turned, (0, above_floor, front + long / 2 - 0.02))
 
 
 def _wings(draw: Draw, x: Number, low: float, tall: float, depth: float, back: float) -> Part:

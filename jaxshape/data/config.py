@@ -1,0 +1,42 @@
+"""Settings of a dataset and of the inputs drawn from it; free of JAX, for the command line."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What, with the objects themselves, decides every byte of a dataset."""
+
+    views: int = 18
+    """Random views of each object (paper: 18)."""
+    noisy: float = 0.5
+    """Share of the objects whose depth images get the faults of a real sensor."""
+    up: Axis = "y"
+    """Axis of the mesh files that points up."""
+    front: Axis = "z"
+    """Axis of the mesh files along which the object's front looks."""
+    seed: int = 0
+    """Of views, noise and surface samples."""
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """What a training input goes through, so that it looks like those of a reconstruction."""
+
+    max_views: int = 18
+    """Inputs fuse 1 to this many random views (paper: 1)."""
+    complete: float = 0.1
+    """Share of the inputs that are the complete surface itself."""
+    mirror: bool = True
+    """Exchange left and right in half of the pairs."""
+    scale: float = 0.0
+    """Shrink each axis by up to this share, as a box that is a little too large would."""
+    pose_error: float = 0.05
+    """Share of the views that lie a voxel off along each axis."""
+    missing: float = 0.1
+    """Share of the views that lack a region, as where a sensor returns nothing."""
+    segmentation: float = 0.02
+    """Share of the views whose mask is wrong: it cuts a piece off, or takes in some background."""

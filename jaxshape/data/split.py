@@ -1,0 +1,31 @@
+"""Which meshes of a collection are kept out of training. [host]"""
+
+import hashlib
+from collections.abc import Sequence
+
+from jaxshape.data.archives import MeshSource
+
+SHARE = 0.1
+"""Of the meshes that are held out."""
+
+
+def hold_out(sources: Sequence[MeshSource]) -> tuple[list[MeshSource], list[MeshSource]]:
+    """The meshes to train on, and about every tenth, but at least one, held out to be scored.
+
+    Which ones depends on their names alone: a mesh stays on its side when others join the
+    collection, so that training can go on from earlier weights and never meets one it is scored on.
+    `ValueError` where there are fewer than two.
+    """
+    if len(sources) < 2:
+        raise ValueError(
+            f"There is {len(sources)} mesh; give two or more, to train on some and score on others."
+        )
+    by_mark = sorted(sources, key=_mark)
+    marked = sum(_mark(source) < SHARE for source in sources)
+    held_out = by_mark[: min(max(marked, 1), len(sources) - 1)]
+    return [source for source in sources if source not in held_out], held_out
+
+
+def _mark(source: MeshSource) -> float:
+    """A number from 0 to 1 that is spread evenly over names."""
+    return int.from_bytes(hashlib.sha256(source.name.encode()).digest()[:8]) / 2**64
