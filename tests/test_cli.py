@@ -5,6 +5,9 @@ import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import islice
 
 import jax
 import numpy as np
@@ -13,10 +16,15 @@ import trimesh
 from PIL import Image
 from scene import write_scene
 
-from jaxshape import cli
+from jaxshape import cli, process
+from jaxshape.cli.learning import preset_in
+from jaxshape.data import dataset
+from jaxshape.data.archives import list_meshes
 from jaxshape.data.chairs import random_chair
-from jaxshape.model import weights
-from jaxshape.model.weights import save_prior
+from jaxshape.data.split import hold_out
+from jaxshape.model import training, weights
+from jaxshape.model.config import PRESETS
+from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prior
 from jaxshape.refine.methods import families
 from jaxshape.results import evaluation
 from jaxshape.results.plots import plot_search
@@ -215,7 +223,6 @@ def test_a_search_that_cannot_be_is_refused_before_frames_are_read(
         (("--frames", "0"), "--frames is '0'"),
         (("--frames", "2,2"), "--frames is '2,2'"),
         (("--methods", "encoder,magic"), "no method 'magic'"),
-        (("--up", "q"), "up must be one of"),
         (("--up", "z"), "must be perpendicular"),
     ],
 )
@@ -227,7 +234,7 @@ def test_options_of_an_evaluation_out_of_range_are_refused(
     assert said in refused("evaluate", *some, *options)
 
 
-def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior):
+def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior, linear_weights):
     save_prior(tmp_path / "tiny.safetensors", prior, {})
     tiny = ("--weights", tmp_path / "tiny.safetensors")
     (tmp_path / "empty.ply").write_bytes(b"")
@@ -238,7 +245,7 @@ def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior)
     lying = trimesh.load_mesh(chair)
     lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     lying.export(tmp_path / "lying.ply")
-    said = refused("evaluate", "--meshes", tmp_path / "lying.ply", *tiny)
+    said = refused("evaluate", "--meshes", tmp_path / "lying.ply")
     assert "lie on their side" in said and "--up z" in said
 
 
@@ -255,10 +262,46 @@ def test_other_weights_are_refused(chair, refused, tmp_path, prior):
     assert "weights of another architecture" in said
 
 
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (("--steps", 0), "--steps is 0"),
+        (("--batch", 0), "--batch is 0"),
+        (("--learning-rate", 0), "--learning-rate is 0"),
+        (("--learning-rate", "nan"), "--learning-rate is nan"),
+        (("--occupied-weight", 0), "--occupied-weight is 0"),
+        (("--code-noise", -1), "--code-noise is -1"),
+        (("--code-weight", "inf"), "--code-weight is inf"),
+        (("--report-every", 0), "--report-every is 0"),
+        (("--encoder", 4, 0, 8, 8), "--encoder is 4 0 8 8"),
+        (("--code", 1), "--code is 1"),
+        (("--max-views", 0), "--max-views is 0"),
+        (("--complete", 1.1), "--complete is 1.1"),
+        (("--scale", 1), "--scale is 1"),
+        (("--missing", -0.1), "--missing is -0.1"),
+        (("--name", "a/b"), "--name is 'a/b'"),
+        (("--meshes", "mugs"), "either --dataset FOLDER or --meshes FOLDER"),
+        (("--start", "nowhere.safetensors"), "There is no weights file"),
+        (("--process", 1), "Without coordinator and processes"),
+        (("--processes", 2, "--process", 2), "--process is 2 of 2"),
+    ],
+)
+def test_a_training_run_that_cannot_be_is_refused(refused, tmp_path, options, said):
+    assert said in refused("train", "--dataset", tmp_path / "nowhere", *options)
+
+
+def test_a_collection_of_meshes_that_cannot_be_trained_on_is_refused(chair, refused, tmp_path):
+    assert "either --dataset FOLDER or --meshes FOLDER" in refused("train")
+    assert "give two or more" in refused("train", "--meshes", chair)
+    assert "must be perpendicular" in refused("train", "--meshes", chair, "--front", "-y")
+    assert "no file or folder" in refused("train", "--meshes", tmp_path / "nowhere")
+
+
 def test_a_missing_dataset_is_refused(refused, tmp_path):
     assert "There is no dataset" in refused("train", "--dataset", tmp_path / "nowhere")
     assert "--chairs is 0" in refused("dataset", "--chairs", 0)
     assert "--views is 0" in refused("dataset", "--views", 0)
+    assert "--noisy is 1.5" in refused("dataset", "--noisy", 1.5)
 
 
 # --- what works -------------------------------------------------------------------------------
@@ -352,6 +395,185 @@ def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
     assert asked == [3, 3, 2]
 
 
+# --- training ---------------------------------------------------------------------------------
+
+
+def test_a_preset_gives_the_defaults_of_the_other_options(monkeypatch):
+    assert preset_in(["train", "--preset=paper", "--front", "-y"]) == PRESETS["paper"]
+    for preset, arguments, changed in (
+        ("default", (), {}),
+        ("paper", (), {}),
+        ("paper", ("--steps", "7"), {"steps": 7}),
+        ("default", ("--learning-rate", "0.5"), {"learning_rate": 0.5}),
+    ):
+        asked = []
+        monkeypatch.setattr(cli.Train, "run", lambda command, asked=asked: asked.append(command))
+        for order in ((*arguments, "--preset", preset), ("--preset", preset, *arguments)):
+            monkeypatch.setattr(sys, "argv", ["jaxshape", "train", "--dataset", "data", *order])
+            cli.main()
+        assert [command.config for command in asked] == 2 * [replace(PRESETS[preset], **changed)]
+    nested = ("--code", "12", "--no-mirror", "--decoder", "8", "4", "2")
+    monkeypatch.setattr(sys, "argv", ["jaxshape", "train", "--preset", "paper", *nested])
+    cli.main()
+    assert asked[-1].config.architecture == replace(
+        PRESETS["paper"].architecture, code=12, decoder=(8, 4, 2)
+    )
+    assert asked[-1].preset == "paper" and not asked[-1].config.inputs.mirror
+
+
+def test_help_shows_the_values_of_the_preset(run):
+    for preset, steps in (("default", PRESETS["default"].steps), ("paper", PRESETS["paper"].steps)):
+        status, out, _ = run("train", "--preset", preset, "--help")
+        assert status == 0 and f"(default: {steps})" in out
+        assert "srun" in out and "--coordinator" in out
+
+
+@pytest.mark.parametrize("options, asked", [
+    (("--distributed",), (None, None, None)),
+    (("--coordinator", "host:1", "--processes", 2, "--process", 1), ("host:1", 2, 1)),
+    ((), None),
+])  # fmt: skip
+def test_machines_join_before_anything_is_read(run, monkeypatch, tmp_path, options, asked):
+    joined = []
+    monkeypatch.setattr(process, "join_processes", lambda *given: joined.append(given))
+    assert run("train", "--dataset", tmp_path / "nowhere", *options)[0] == 2
+    assert joined == ([asked] if asked else [])
+
+
+def test_only_the_first_process_speaks_and_writes(run, collection, tmp_path, monkeypatch, prior):
+    run("dataset", "--meshes", collection, "--views", 2, "--output", tmp_path / "data")
+    for index in (1, 0):
+        monkeypatch.setattr(jax, "process_index", lambda index=index: index)
+        arguments = ("train", "--dataset", tmp_path / "data", "--output", tmp_path / "out")
+        status, out, err = run(*arguments, *TINY)
+        assert (status, bool(out), bool(err)) == (0, index == 0, index == 0)
+        assert (tmp_path / "out" / "weights.safetensors").exists() == (index == 0)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "weights.safetensors", "weights.md", "card.json", "metrics.jsonl"
+    }  # fmt: skip
+    status, _, err = run("train", "--meshes", collection, "--output", tmp_path / "mesh", *TINY)
+    assert status == 0, err
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    status, _, err = run("train", "--meshes", collection, "--output", tmp_path / "two", *TINY)
+    assert status == 2 and "make it first with jaxshape dataset" in err
+
+
+TINY = ("--steps", 4, "--batch", 2, "--encoder", 4, 4, 8, 8, "--decoder", 8, 8, 4, "--code", 10)
+
+
+@pytest.fixture
+def collection(tmp_path, monkeypatch, prior):
+    """A folder of twelve boxes, one unusable, and everything slow about training on it replaced."""
+    folder = tmp_path / "boxes"
+    folder.mkdir()
+    for i in range(12):
+        trimesh.creation.box((1, 2, 3 + i)).export(folder / f"box-{i}.ply")
+    (folder / "empty.ply").write_bytes(b"")
+
+    def grids(mesh, config, seed):
+        random = np.random.default_rng(seed)
+        return dataset.pack(random.random((1 + config.views, 32, 32, 32)) < 0.5)
+
+    def train(folder, data, config, start=None):
+        done = [report.step for report in training.read_metrics(folder)]
+        for step in range(max(done, default=0) + 1, config.steps + 1):
+            report = training.Report(step, 0.1 * step, 0.5, 10.0, 2.0)
+            if jax.process_index() == 0:
+                training._record(folder, report)
+            yield report
+
+    def evaluate(prior, models, config):
+        scores = dict.fromkeys(("iou", "iou_composed", "chamfer_l1", "f_score", "objective"), 0.5)
+        bounds = {"occluded_empty": 0.25, "occluded_full": 0.125}
+        one = {method: scores for method in config.methods} | {"bounds": bounds}
+        for model in models:
+            frames = {str(k): one for k in config.frames}
+            yield {"name": model.name, "metadata": {}, "frames": frames}
+
+    monkeypatch.setattr(dataset, "ProcessPoolExecutor", lambda n, mp_context: ThreadPoolExecutor(n))
+    monkeypatch.setattr(dataset, "training_grids", grids)
+    monkeypatch.setattr(training, "train", train)
+    monkeypatch.setattr(training, "finished_prior", lambda *_: prior)
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    return folder
+
+
+def killed_after(function, count):
+    """The generator, until it is killed after so many yields."""
+
+    def part(*arguments, **settings):
+        yield from islice(function(*arguments, **settings), count)
+        raise OSError("killed.")
+
+    return part
+
+
+STAGES = ((dataset, "build_dataset"), (training, "train"), (evaluation, "evaluate"))
+
+
+def test_own_category_in_one_command_however_often_it_is_killed(
+    run, collection, tmp_path, monkeypatch, prior
+):
+    """Killed while the dataset is built, while it trains and while it is scored."""
+    output = tmp_path / "out"
+    command = ("train", "--meshes", collection, "--name", "box", "--output", output, *TINY)
+    whole, trained = training.train, []
+
+    def train(folder, data, config, start=None):
+        trained.append(data.names)
+        return whole(folder, data, config, start)
+
+    monkeypatch.setattr(training, "train", train)
+    for module, name in STAGES:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(module, name, killed_after(getattr(module, name), 1))
+            status, _, err = run(*command)
+        assert status == 2 and "killed" in err, err
+        assert not (output / "box.md").exists()
+    status, out, err = run(*command)
+    assert status == 0, err
+    training_set, held_out = (
+        {source.name for source in part} for part in hold_out(list_meshes(collection))
+    )
+    assert trained == 3 * [sorted(training_set - {"empty"})]
+    content = json.loads((output / "evaluation.json").read_text())
+    assert {scores["name"] for scores in content["per_mesh"]} == held_out - {"empty"}
+    assert list(content["means"]) == ["1", "4", "8", "18"]
+    assert list(content["means"]["1"]) == ["encoder", "cma", "bounds"]
+    assert fingerprint(load_prior(output / "box.safetensors"))
+    card = load_card(output / "box.safetensors")
+    assert card == json.loads((output / "card.json").read_text())
+    assert card["samples"] == 8 and card["training_loss"] == 0.4 and card["training_seconds"] == 8
+    assert "| 18 | cma | 0.500 |" in (output / "box.md").read_text()
+    assert "cma" in out and "box.safetensors" in out
+    assert {path.name for path in output.iterdir()} == {
+        "box.safetensors", "box.md", "card.json", "dataset", "evaluation.json", "metrics.jsonl"
+    }  # fmt: skip
+
+
+def test_training_goes_on_from_the_weights_of_another(
+    run, collection, tmp_path, monkeypatch, prior
+):
+    given = []
+    whole = training.train
+
+    def train(folder, data, config, start=None):
+        given.append(start)
+        return whole(folder, data, config, start)
+
+    monkeypatch.setattr(training, "train", train)
+    first = tmp_path / "first.safetensors"
+    save_prior(first, prior, {"samples": 100, "samples_before": 20})
+    command = ("train", "--meshes", collection, "--start", first, *TINY)
+    assert run(*command, "--licence", "CC0", "--output", tmp_path / "out")[0] == 0
+    assert fingerprint(given[0]) == fingerprint(load_prior(first))
+    card = load_card(tmp_path / "out" / "weights.safetensors")
+    assert (card["samples_before"], card["samples"]) == (120, 8)
+    assert card["start"] == fingerprint(load_prior(first)) and card["licence"] == "CC0"
+    text = (tmp_path / "out" / "weights.md").read_text()
+    assert "after 120 samples" in text and "| Licence | CC0 |" in text
+
+
 @pytest.mark.slow
 def test_from_dataset_to_training_to_reconstruction(run, chair, tmp_path):
     data, trained = tmp_path / "data", tmp_path / "train"
@@ -373,3 +595,22 @@ def test_from_dataset_to_training_to_reconstruction(run, chair, tmp_path):
     assert status == 0, err
     result = json.loads((tmp_path / "demo" / "result.json").read_text())
     assert {"iou_encoder", "iou_refined", "iou_composed", "seconds"} <= set(result)
+
+
+@pytest.mark.slow
+def test_from_meshes_to_scored_weights(run, tmp_path):
+    """Own category with nothing replaced; asked for again, it has nothing left to train."""
+    (tmp_path / "boxes").mkdir()
+    for i in range(12):
+        trimesh.creation.box((1, 1 + i / 10, 2)).export(tmp_path / "boxes" / f"{i}.ply")
+    command = ("train", "--meshes", tmp_path / "boxes", "--name", "box", *TINY)
+    outcomes = []
+    for _ in range(2):
+        status, out, err = run(*command, "--output", tmp_path / "out")
+        assert status == 0, err
+        trained = tmp_path / "out" / "box.safetensors"
+        metrics = (tmp_path / "out" / "metrics.jsonl").read_text()
+        outcomes.append((fingerprint(load_prior(trained)), load_card(trained), metrics, out))
+    assert outcomes[0] == outcomes[1]
+    means = json.loads((tmp_path / "out" / "evaluation.json").read_text())["means"]
+    assert 0 <= means["4"]["cma"]["iou"] <= 1

@@ -1,0 +1,54 @@
+"""The `jaxshape` command. [host]
+
+Each subcommand is a frozen dataclass: its fields are its options, its docstring is its help, and
+its `run` does the work. Bad input ends with one sentence on standard error and exit status 2, and
+leaves earlier output as it was. JAX, and all that needs it, is imported inside `run`, so that
+`--help` answers at once.
+
+    rebuild    demo, reconstruct
+    learning   dataset, train
+    scoring    evaluate, plot
+"""
+
+import sys
+import warnings
+from typing import Annotated, Any
+
+import tyro
+from rich.markup import escape
+from tyro.conf import subcommand
+
+from jaxshape.cli.common import console
+from jaxshape.cli.learning import Dataset, Train, preset_in
+from jaxshape.cli.rebuild import Demo, Reconstruct
+from jaxshape.cli.scoring import Evaluate, Plot
+from jaxshape.process import prepare_process
+
+
+def commands(train: Train) -> Any:
+    """The table of commands; `train` holds the defaults of its own."""
+    return (
+        Annotated[Demo, subcommand("demo")]
+        | Annotated[Dataset, subcommand("dataset")]
+        | Annotated[Train, subcommand("train", default=train)]
+        | Annotated[Reconstruct, subcommand("reconstruct")]
+        | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Plot, subcommand("plot")]
+    )
+
+
+def main() -> None:
+    """Run the command line; the entry point of the console script."""
+    warnings.showwarning = lambda message, *_, **__: console.print(f"[yellow]warning[/] {message}")
+    table = commands(Train(config=preset_in(sys.argv[1:])))
+    command = tyro.cli(table, prog="jaxshape")
+    prepare_process()
+    try:
+        command.run()
+    except (ValueError, OSError) as problem:
+        # Sentences for the user, by the convention of the package; anything else is a bug.
+        console.print(f"[red]jaxshape:[/] {escape(str(problem))}", soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("stopped")
+        sys.exit(130)

@@ -1,0 +1,6 @@
+"""`python -m jaxshape.cli` is `jaxshape`."""
+
+from jaxshape.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""`jaxshape dataset` and `jaxshape train`: from objects to a shape prior."""
+
+import json
+import os
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from jaxshape.cli.common import console, progress_bar, report_skipped, require
+from jaxshape.cli.options import Axes, Machines, checked_dataset, checked_training
+from jaxshape.cli.scoring import load_models, score
+from jaxshape.data.config import DatasetConfig
+from jaxshape.files import atomic_path
+from jaxshape.model.config import PRESETS, TrainConfig
+from jaxshape.refine.config import RefineConfig
+
+PROCESSORS = os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Build training pairs: single views and complete surfaces, 4 KiB a grid.
+
+    Examples: jaxshape dataset --output data/chairs
+
+    jaxshape dataset --output data/mugs --meshes mugs/ --up z --front -y
+    """
+
+    output: Path
+    """Folder of the dataset; a build that was killed goes on when asked for again."""
+    chairs: int = 8000
+    """Procedural chairs to make, unless --meshes is given."""
+    meshes: Path | None = None
+    """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural chairs."""
+    config: tyro.conf.OmitArgPrefixes[DatasetConfig] = DatasetConfig()
+    workers: int = PROCESSORS
+    """Processes."""
+
+    def run(self) -> None:
+        from jaxshape.data.archives import list_meshes
+        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.meshes import axes_to_canonical
+
+        require(1 <= self.chairs <= TEST_SEEDS, f"--chairs is {self.chairs}; give 1 to 1000000.")
+        require(self.workers >= 1, f"--workers is {self.workers}; give 1 or more.")
+        config = checked_dataset(self.config)
+        axes_to_canonical(config.up, config.front)
+        objects: Sequence[Any] = list_meshes(self.meshes) if self.meshes else range(self.chairs)
+        build(self.output, objects, config, self.workers)
+
+
+def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: int) -> None:
+    """Build a dataset, or what is missing of it, with a bar."""
+    from jaxshape.data.dataset import build_dataset
+
+    skipped = []
+    with progress_bar("objects") as bar:
+        task = bar.add_task("dataset", total=len(objects), note="")
+        for done in build_dataset(folder, objects, config, workers=workers):
+            skipped = done.skipped
+            note = f"{len(skipped)} skipped" if skipped else ""
+            bar.update(task, completed=done.objects, note=note)
+    report_skipped(skipped)
+    require(
+        len(skipped) < len(objects),
+        f"None of the {len(objects)} meshes could be used; see the reasons above.",
+    )
+
+
+Preset = Literal["default", "paper"]
+
+
+def preset_in(arguments: Sequence[str]) -> TrainConfig:
+    """The settings that --preset asks for: the defaults of the other options of `train`."""
+
+    @dataclass(frozen=True)
+    class Asked:
+        preset: Preset = "default"
+
+    asked, _ = tyro.cli(
+        Asked, prog="jaxshape", args=arguments, return_unknown_args=True, add_help=False
+    )
+    return PRESETS[asked.preset]
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train the auto-encoder on a dataset, or on a folder of meshes; the same command resumes.
+
+    Examples: jaxshape train --dataset data/chairs --output out/train
+
+    jaxshape train --meshes mugs/ --name mug --up z --front -y
+
+    With --meshes, about every tenth mesh is kept out of training and scored afterwards.
+    """
+
+    dataset: Path | None = None
+    """Folder made by `jaxshape dataset`."""
+    meshes: Path | None = None
+    """Mesh archive or folder (ShapeNet, ModelNet, ...) to train on, instead of --dataset."""
+    axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
+    name: str = "weights"
+    """Of the weights file and its card; with --meshes, the kind of object."""
+    output: Path | None = None
+    """Folder for NAME.safetensors, NAME.md, card.json, metrics.jsonl and the checkpoint, and with
+    --meshes for the dataset and evaluation.json; out/NAME where not given."""
+    start: Path | None = None
+    """Weights to begin with, of the same sizes, instead of random ones."""
+    licence: str = "not stated"
+    """Of the weights, for their card; what is right depends on the meshes, too."""
+    preset: Preset = "default"
+    """What the options below are unless given: what we found best, or the paper's own; train
+    --preset paper --help shows these."""
+    config: tyro.conf.OmitArgPrefixes[TrainConfig] = TrainConfig()
+    machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
+
+    def run(self) -> None:
+        from jaxshape.data.dataset import open_dataset
+        from jaxshape.model.weights import load_prior
+
+        checked_training(self.config)
+        require(
+            (self.dataset is None) != (self.meshes is None),
+            "Give either --dataset FOLDER or --meshes FOLDER, to say what to train on.",
+        )
+        require(
+            re.fullmatch(r"\w[\w.-]*", self.name) is not None,
+            f"--name is {self.name!r}; give a plain name, such as mug.",
+        )
+        self.machines.join()
+        output = self.output or Path("out") / self.name
+        start = load_prior(self.start) if self.start else None
+        folder, held_out = self.dataset, None
+        if folder is None:
+            folder, held_out = self.build(output)
+        data = open_dataset(folder)
+        is_first = _fit(output, data, self.config, start)
+        if is_first:
+            about = json.loads((folder / "dataset.json").read_text())
+            about |= {"source": str(self.meshes or self.dataset), "used": len(data.names)}
+            self.write(output, data, about, held_out)
+
+    def build(self, output: Path) -> tuple[Path, tuple[list[Any], list[Any]]]:
+        """The folder of a dataset of --meshes; the models kept out of it, and those skipped."""
+        import jax
+
+        from jaxshape.data.archives import list_meshes
+        from jaxshape.data.meshes import axes_to_canonical
+        from jaxshape.data.split import hold_out
+
+        assert self.meshes is not None
+        axes_to_canonical(self.axes.up, self.axes.front)
+        require(
+            jax.process_count() == 1,
+            "Several processes cannot build one dataset; make it first with jaxshape dataset "
+            "--meshes, and give its folder as --dataset.",
+        )
+        training, held_out = hold_out(list_meshes(self.meshes))
+        models = load_models(held_out, self.axes)  # refused now, not after hours of training
+        config = DatasetConfig(up=self.axes.up, front=self.axes.front, seed=self.config.seed)
+        build(output / "dataset", training, config, PROCESSORS)
+        return output / "dataset", models
+
+    def write(self, output: Path, data: Any, about: dict[str, Any], held_out: Any) -> None:
+        """Write the weights and cards of a finished run, and score it on what was held out."""
+        from jaxshape.model.training import finished_prior, read_metrics
+        from jaxshape.model.weights import load_prior, save_prior
+        from jaxshape.results.card import describe, training_card
+        from jaxshape.results.evaluation import EvaluateConfig
+
+        card = training_card(
+            self.config,
+            read_metrics(output),
+            about,
+            start=self.start,
+            command=shlex.join(["jaxshape", *sys.argv[1:]]),
+            licence=self.licence,
+        )
+        weights = output / f"{self.name}.safetensors"
+        save_prior(weights, finished_prior(output, data, self.config), card)
+        _write_text(output / "card.json", json.dumps(card, indent=2))
+        scores = None
+        if held_out:
+            config = EvaluateConfig(
+                methods=("encoder", "cma"),
+                refine=RefineConfig(iterations=50),
+                seed=self.config.seed,
+            )
+            settings = {"meshes": f"held out of {self.meshes}", "weights": str(weights)}
+            prior = load_prior(weights)  # as it is used: in half precision
+            scores = score(output / "evaluation.json", prior, config, settings, *held_out)
+        _write_text(output / f"{self.name}.md", describe(self.name, card, scores))
+        print(f"wrote {weights} and its card, {self.name}.md")
+
+
+def _fit(output: Path, data: Any, config: TrainConfig, start: Any) -> bool:
+    """Train with a bar; returns whether this process is the one that writes."""
+    import jax
+
+    from jaxshape.model.training import read_metrics, train
+
+    console.quiet = jax.process_index() > 0
+    done = max((report.step for report in read_metrics(output)), default=0)
+    note = "compiling" if done < config.steps else ""
+    with progress_bar("steps") as bar:
+        task = bar.add_task("train", total=config.steps, completed=done, note=note)
+        for report in train(output, data, config, start):
+            note = (
+                f"loss {report.loss:.4f}  IoU {report.iou:.3f}  "
+                f"{report.samples_per_second:.0f} samples/s"
+            )
+            bar.update(task, completed=report.step, note=note)
+    return jax.process_index() == 0
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text)

@@ -1,0 +1,204 @@
+"""`jaxshape evaluate` and `jaxshape plot`: how good results are, and how a search went."""
+
+import json
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional
+
+from jaxshape.cli.common import progress_bar, report_skipped, require
+from jaxshape.cli.options import Axes, checked_numbers, checked_search
+from jaxshape.files import atomic_path
+from jaxshape.refine.config import RefineConfig
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score methods on meshes seen along an orbit at 30 degrees elevation.
+
+    Example: jaxshape evaluate --meshes chairs/ --frames 1,4,8,18 --methods encoder,gradient,cma
+    --output scores.json
+    """
+
+    output: Path
+    """JSON file for config, per_mesh and means."""
+    meshes: Path | None = None
+    """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
+    axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
+    chairs: int = 0
+    """Procedural test chairs to use instead of --meshes."""
+    frames: str = "1,4,8,18"
+    """Numbers of frames to fuse, with commas: the first k of an orbit in steps of 20 degrees."""
+    methods: str = "encoder,gradient,cma"
+    """Methods to score, with commas; those of `jaxshape reconstruct --method`."""
+    noise: bool = False
+    """Add the faults of a real depth sensor."""
+    ceiling: bool = False
+    """Score too what the weights could draw at best: the code fitted to the whole truth."""
+    weights: Path | None = None
+    """Weights to use instead of those that come with the package."""
+    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
+    seed: int = 0
+    """Of noise, surface samples and searches."""
+
+    def run(self) -> None:
+        from jaxshape.data.archives import list_meshes
+        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.meshes import axes_to_canonical
+        from jaxshape.model.weights import load_prior
+        from jaxshape.results import evaluation
+
+        config = evaluation.EvaluateConfig(
+            frames=checked_numbers(self.frames, "--frames"),
+            methods=tuple(self.methods.split(",")),
+            noise=self.noise,
+            ceiling=self.ceiling,
+            refine=checked_search(self.search),
+            seed=self.seed,
+        )
+        axes_to_canonical(self.axes.up, self.axes.front)
+        require(
+            (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
+            "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",
+        )
+        test_seeds = range(TEST_SEEDS, TEST_SEEDS + self.chairs)
+        sources = list_meshes(self.meshes) if self.meshes else test_seeds
+        prior = load_prior(self.weights)
+        evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
+        models, skipped = load_models(sources, self.axes)
+        _check_upright(models, refuse=self.weights is None)
+        about = {
+            "meshes": str(self.meshes) if self.meshes else f"{self.chairs} procedural chairs",
+            **asdict(self.axes),
+            "weights": str(self.weights) if self.weights else "chair (packaged)",
+        }
+        score(self.output, prior, config, about, models, skipped)
+
+
+def load_models(sources: Sequence[Any], axes: Axes) -> tuple[list[Any], list[Any]]:
+    """The meshes (`Model`) that can be used, and those that are `Skipped`."""
+    from jaxshape.data.dataset import load_object
+    from jaxshape.data.meshes import Skipped
+
+    with progress_bar("meshes") as bar:
+        task = bar.add_task("read", note="")
+        watched = bar.track(sources, task_id=task)
+        found = [load_object(source, up=axes.up, front=axes.front) for source in watched]
+    skipped = [f for f in found if isinstance(f, Skipped)]
+    models = [f for f in found if not isinstance(f, Skipped)]
+    report_skipped(skipped)
+    require(
+        bool(models),
+        f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
+        f"{skipped[0].reason}. {skipped[0].detail}"
+        if skipped
+        else "",
+    )
+    return models, skipped
+
+
+def _check_upright(models: Sequence[Any], *, refuse: bool) -> None:
+    """Refuse a set of seats that seems to lie on its side; other weights may be of other things."""
+    from jaxshape.data.meshes import lying_on_its_side
+
+    lying = [model.name for model in models if lying_on_its_side(model.mesh)]
+    if 2 * len(lying) > len(models):
+        complaint = (
+            f"{len(lying)} of {len(models)} meshes seem to lie on their side, {lying[0]!r} for "
+            "one{}; name the axis that points up, for example --up z --front -y."
+        )
+        require(not refuse, complaint.format(""))
+        warnings.warn(complaint.format(", if they are seats"), stacklevel=2)
+
+
+def score(
+    output: Path,
+    prior: Any,
+    config: Any,
+    about: dict[str, Any],
+    models: Sequence[Any],
+    skipped: Sequence[Any],
+) -> dict[str, Any]:
+    """Score models, write the results file, print its table; returns what the file holds.
+
+    `config` is an `EvaluateConfig`; `about` says where meshes and weights come from. An evaluation
+    that was killed goes on when asked for again with the same weights and settings.
+    """
+    start = time.perf_counter()
+    from jaxshape.data.meshes import Skipped
+    from jaxshape.model.weights import fingerprint
+    from jaxshape.results import evaluation
+
+    settings = json.dumps(asdict(config) | about | {"fingerprint": fingerprint(prior)})
+    per_mesh = evaluation.read_journal(output, settings)
+    scored = {scores["name"] for scores in per_mesh}
+    left = [model for model in models if model.name not in scored]
+    with progress_bar("meshes") as bar:
+        task = bar.add_task("evaluate", total=len(models), completed=len(scored), note="")
+        for scores in evaluation.evaluate(prior, left, config):
+            if isinstance(scores, Skipped):
+                skipped = [*skipped, scores]
+                report_skipped([scores])
+            else:
+                per_mesh.append(scores)
+                evaluation.write_journal(output, settings, per_mesh)
+            bar.update(task, advance=1)
+    require(bool(per_mesh), "No mesh could be scored; see the reasons above.")
+    seconds = round(time.perf_counter() - start, 1)
+    content = {
+        "config": asdict(config) | about | {"seconds": seconds},
+        "skipped": [s._asdict() for s in skipped],
+        "per_mesh": per_mesh,
+        "means": evaluation.summarize(per_mesh, config),
+    }
+    with atomic_path(output) as path:
+        path.write_text(json.dumps(content, indent=1))
+    evaluation.remove_journal(output)
+    _print_table(content["means"], len(per_mesh))
+    return content
+
+
+def _print_table(means: dict[str, Any], count: int) -> None:
+    from jaxshape.results.card import COLUMNS, rows_of
+
+    table = Table(title=f"means over {count} meshes", title_justify="left")
+    for column in COLUMNS:
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for row in rows_of(means):
+        table.add_row(*row)
+    Console().print(table)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Plot the search behind a result, or compare several.
+
+    Examples: jaxshape plot out/demo
+
+    jaxshape plot out/cma out/hybrid --output compare.svg
+    """
+
+    results: Positional[tuple[Path, ...]]
+    """Folders made by `jaxshape reconstruct` or `jaxshape demo`; several are compared."""
+    output: Path | None = None
+    """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder where not given."""
+
+    def run(self) -> None:
+        from jaxshape.results.plots import compare_searches, plot_search
+        from jaxshape.results.traces import read_search
+
+        require(bool(self.results), "Give one result folder or more.")
+        searches = [read_search(folder) for folder in self.results]
+        output = self.output or self.results[0] / "trace.png"
+        if len(searches) == 1:
+            plot_search(output, searches[0])
+        else:
+            compare_searches(output, searches)
+        print(f"wrote {output}")

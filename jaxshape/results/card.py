@@ -1,0 +1,178 @@
+"""The model card of a training run: what the weights were made from, how, and how good they are.
+
+A card is a dictionary, kept in the weights file and as JSON; `describe` writes it out in Markdown.
+"""
+
+import os
+import platform
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxshape.model import weights
+from jaxshape.model.config import TrainConfig
+from jaxshape.model.training import Report
+
+COLUMNS = ("frames", "method", "IoU", "IoU composed", "Chamfer-L1", "F-score", "objective")
+
+
+_BOUNDS = {"occluded_empty": "F", "occluded_full": "F or M", "ceiling": "ceiling"}
+
+FEW = 1000
+"""Objects below which a card warns of memorising."""
+
+
+def training_card(
+    config: TrainConfig,
+    metrics: Sequence[Report],
+    data: dict[str, Any],
+    *,
+    start: Path | None,
+    command: str,
+    licence: str,
+) -> dict[str, Any]:
+    """The card of a finished run.
+
+    `data` is what the dataset says of itself, with its `source` and the number of objects `used`;
+    `start` the weights it began with, whose own samples are counted under `samples_before`.
+    """
+    before = weights.load_card(start) if start else {}
+    return {
+        "data": data,
+        "licence": licence,
+        "command": command,
+        "config": asdict(config),
+        "seed": config.seed,
+        "samples": config.steps * config.batch,
+        "samples_before": before.get("samples", 0) + before.get("samples_before", 0),
+        "start": weights.fingerprint(weights.load_prior(start)) if start else None,
+        "training_loss": metrics[-1].loss,
+        "training_iou": metrics[-1].iou,
+        "training_seconds": round(sum(report.seconds for report in metrics)),
+        "hardware": hardware(),
+    }
+
+
+def rows_of(means: dict[str, Any]) -> Iterator[list[str]]:
+    """The means of an evaluation as rows of a table under `COLUMNS`."""
+    for frames, methods in means.items():
+        for method, scores in methods.items():
+            if method == "bounds":
+                for name, value in scores.items():
+                    yield [frames, _BOUNDS[name], f"{value:.3f}", *[""] * (len(COLUMNS) - 3)]
+            else:
+                values = [f"{x:.{4 if name == 'chamfer_l1' else 3}f}" for name, x in scores.items()]
+                yield [frames, method, *values]
+
+
+def markdown_table(means: dict[str, Any]) -> str:
+    """The means of an evaluation as a Markdown table."""
+    header = [list(COLUMNS), ["--:", "---"] + ["--:"] * (len(COLUMNS) - 2)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [*header, *rows_of(means)])
+
+
+def hardware() -> str:
+    """The devices and versions that this process computes with."""
+    kinds = Counter(device.device_kind for device in jax.devices())
+    cores = f"{os.cpu_count()} CPU cores ({_processor()})"
+    devices = ", ".join(cores if k == "cpu" else f"{count} x {k}" for k, count in kinds.items())
+    return f"{devices}, Python {platform.python_version()}, jax {jax.__version__}"
+
+
+def _processor() -> str:
+    """The name of the processor, where the system tells."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def describe(name: str, card: dict[str, Any], scores: dict[str, Any] | None = None) -> str:
+    """The card of `name`.safetensors in Markdown, with the figures of an evaluation if any."""
+    sizes = card["config"]["architecture"]
+    facts = "\n".join(f"| {fact} | {text} |" for fact, text in _facts(card).items())
+    limits = "\n".join(f"- {limit}" for limit in _limits(card, scores))
+    return f"""# Model card: {name}.safetensors
+
+A shape prior for jaxshape (`--weights {name}.safetensors`): an auto-encoder of 32^3 grids, encoder
+{_chain(sizes["encoder"])}, decoder {_chain([*sizes["decoder"], 1])}, a code of {sizes["code"]} \
+numbers, with the mean and covariance
+of the training codes.
+
+| | |
+|---|---|
+{facts}
+
+## Figures
+
+{_figures(scores)}
+
+## Limits
+
+{limits}
+"""
+
+
+def _chain(channels: Sequence[int]) -> str:
+    return "-".join(map(str, channels))
+
+
+def _facts(card: dict[str, Any]) -> dict[str, str]:
+    data, config = card["data"], card["config"]
+    left_out = data["objects"] - data["used"]
+    facts = {
+        "Data": f"{data['used']:,} objects of `{data['source']}`"
+        + f" ({left_out} more could not be used)" * bool(left_out)
+        + f", {data['config']['views']} random views each, "
+        f"{data['config']['noisy']:.0%} of the objects with sensor noise",
+        "Licence": card["licence"],
+        "Command": f"`{card['command']}`",
+        "Training": f"{card['samples']:,} samples, {config['steps']:,} steps of "
+        f"{config['batch']}; {config['optimizer'].capitalize()}, {config['schedule']} step size, "
+        f"{config['learning_rate']:g} at its peak; "
+        f"{'bfloat16' if config['bfloat16'] else 'float32'}; seed {config['seed']}",
+        "Time and hardware": f"{card['training_seconds']:,} s on {card['hardware']}",
+        "Last training loss": f"{card['training_loss']:.4f} nats per voxel, "
+        f"IoU {card['training_iou']:.3f}",
+    }
+    if card["start"]:
+        before = f"after {card['samples_before']:,} samples"
+        facts["Started from"] = f"weights with the fingerprint {card['start'][:16]}, {before}"
+    return facts
+
+
+def _figures(scores: dict[str, Any] | None) -> str:
+    if scores is None:
+        return "None yet: score the weights on meshes that were held out, `jaxshape evaluate`."
+    return f"""Means over the meshes held out of training, {len(scores["per_mesh"])} of the same \
+folder; first k frames of an orbit at
+30 degrees elevation, no noise, {scores["config"]["refine"]["iterations"]} iterations:
+
+{markdown_table(scores["means"])}
+
+IoU, Chamfer-L1 (a fraction of the bounding-box diagonal) and F-score (at 1 % of the grid's side)
+are of the decoded shape; the composed one keeps what was measured and fills in only what was
+occluded. F is the measurement alone, F or M the same with all that was occluded filled in. Single
+meshes are in evaluation.json."""
+
+
+def _limits(card: dict[str, Any], scores: dict[str, Any] | None) -> Iterator[str]:
+    yield (
+        "Knows objects like those it was trained on and no others: upright, front along +z, each "
+        "axis scaled\n  to fill 30 of 32 voxels. What is thinner than a voxel merges with what is "
+        "beside it."
+    )
+    if scores is not None:
+        yield (
+            "The figures are of meshes from the collection that was trained on, seen by a "
+            "simulated camera with\n  exact poses. Other objects, and real frames, will do worse."
+        )
+    if card["data"]["used"] < FEW:
+        yield (
+            f"{card['data']['used']} objects are few: expect it to remember them rather than to "
+            "know the kind."
+        )

@@ -1,0 +1,26 @@
+"""The experiment runs from its command line, and finished variants are kept."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxshape.data.config import DatasetConfig
+from jaxshape.data.dataset import build_dataset
+
+SCRIPT = Path(__file__).parents[2] / "experiments" / "training_choices.py"
+
+
+@pytest.mark.slow
+def test_smoke(tmp_path):
+    for _ in build_dataset(tmp_path / "data", range(12), DatasetConfig(views=2), workers=1):
+        pass
+    command = [sys.executable, SCRIPT, "--dataset", tmp_path / "data", "--output", tmp_path / "out",
+               "--smoke"]  # fmt: skip
+    first = subprocess.run(command, capture_output=True, text=True, check=True)
+    found = json.loads((tmp_path / "out" / "training_choices.json").read_text())
+    assert set(found) == {"plain", "code 32"} and "step 1" in first.stdout
+    assert 0 <= found["plain"]["procedural"]["8"]["bounds"]["ceiling"] <= 1
+    assert (tmp_path / "out" / "training_choices.png").stat().st_size > 10_000
