@@ -59,6 +59,8 @@ class Config:
     """Folder that keeps the grids of each source."""
     output: Path = RESULTS / "procedural_vs_real.json"
     """The results; the figure lies beside them, as .png."""
+    write_boxes: Path | None = None
+    """Only write the first --chairs of --boxes here, as meshes to train on for comparison."""
     smoke: bool = False
     """Only 20 procedural chairs and as many box chairs."""
 
@@ -554,7 +556,17 @@ def _tidy(ax: Any) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def main(config: Config) -> dict[str, Any]:
+def write_box_chairs(config: Config) -> None:
+    """Box chairs as PLY files. They are research data: so are weights trained on them."""
+    assert config.boxes and config.write_boxes
+    config.write_boxes.mkdir(parents=True, exist_ok=True)
+    for name, mesh in box_chairs(config.boxes, config.chairs):
+        mesh.export(config.write_boxes / f"box-chair-{name}.ply")
+
+
+def main(config: Config) -> dict[str, Any] | None:
+    if config.write_boxes:
+        return write_box_chairs(config)
     start = time.perf_counter()
     results, sources, ious = run(config)
     results["seconds"] = round(time.perf_counter() - start)

@@ -5,14 +5,8 @@ from .data.sequences import open_sequence
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
-from .model.autoencoder import (
-    Architecture,
-    PreparedDecoder,
-    decode,
-    encode,
-    initialize,
-    prepare_decoder,
-)
+from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
+from .model.config import Architecture
 from .model.weights import ShapePrior, load_prior, save_prior
 from .refine.cma import cma
 from .refine.config import RefineConfig
@@ -21,7 +15,13 @@ from .refine.methods.evosax import evosax_strategy
 from .refine.methods.gradient import gradient
 from .refine.methods.hybrid import polished
 from .refine.objective import Target, objective, target
-from .refine.reconstruction import Reconstruction, compose, reconstruct, refiner_for
+from .refine.reconstruction import (
+    Reconstruction,
+    compose,
+    fit_surface,
+    reconstruct,
+    refiner_for,
+)
 from .refine.refiner import Distribution, Refiner, StopReason, Trace
 from .refine.restarts import with_restarts
 from .refine.run import Refined, refine
@@ -60,6 +60,7 @@ __all__ = [
     "f_score",
     "fit_box",
     "fit_box_isotropic",
+    "fit_surface",
     "gradient",
     "initialize",
     "iou",

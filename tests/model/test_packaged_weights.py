@@ -29,12 +29,12 @@ def prior():
 
 @pytest.fixture(scope="module")
 def observed():
-    """F, M and Y of a few chairs nobody trained on, after a noisy orbit."""
+    """F, M and Y of a few chairs nobody trained on, after an orbit."""
     grids = []
     for seed in range(TEST_SEEDS, TEST_SEEDS + CHAIRS):
         mesh = random_chair(seed)
         views = camera.orbit(FRAMES, camera_distance(mesh))
-        seen = capture(mesh, views, noise=True, seed=seed)
+        seen = capture(mesh, views, noise=False, seed=seed)
         merged = fusion.merge_all(measure_frames(seen))
         grids.append((fusion.occupied(merged), fusion.occluded(merged), seen.surface))
     return [jnp.stack(x) for x in zip(*grids, strict=True)]
@@ -63,7 +63,7 @@ def test_the_search_brings_shapes_nearer_to_the_truth(observed, rebuilt):
         float(jnp.mean(iou(grids, observed[2])))
         for grids in (rebuilt.completed_first, rebuilt.completed, rebuilt.composed)
     )
-    assert first > 0.3
+    assert first > 0.45
     assert refined > first
     assert composed > first
     assert np.all(np.asarray(rebuilt.objective) < np.asarray(rebuilt.first_objective))
@@ -72,5 +72,5 @@ def test_the_search_brings_shapes_nearer_to_the_truth(observed, rebuilt):
 def test_they_decode_to_stored_values(prior):
     """A change of format, layout or arithmetic would show here."""
     logits = decode(prior.params, prior.code_mean)
-    expected = [-3.6998, -4.0343, -4.2027, -3.1654, -4.6994, -4.7208, -4.2159, -3.7871]
+    expected = [-5.9285, -5.9050, -5.7864, -4.7429, -5.2473, -4.4433, -4.8925, -4.4301]
     np.testing.assert_allclose(logits[::8, 3::8, 5::8].ravel()[:8], expected, rtol=1e-3, atol=1e-3)

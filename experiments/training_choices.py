@@ -1,0 +1,274 @@
+r"""What each choice in training is worth: small networks at equal budget, judged by what they find.
+
+    jaxshape dataset --output data/chairs --chairs 16000
+    python experiments/training_choices.py --dataset data/chairs --meshes cad_chairs/
+
+and, for the variant that learns from real chairs made of boxes (research data),
+
+    python experiments/procedural_vs_real.py --cad cad_chairs/ --boxes box_chairs.npz \
+        --chairs 3858 --write-boxes boxes/
+    jaxshape dataset --output data/boxes --meshes boxes/
+    python experiments/training_choices.py --dataset data/chairs --meshes cad_chairs/ \
+        --boxes data/boxes
+
+For every variant of `VARIANTS` one network is trained from scratch on the same number of pairs and
+then judged on chairs nobody trained on, procedural ones and meshes if any are given: by the IoU of
+what the encoder, CMA-ES and Adam find from 1, 4 and 8 frames of an orbit, by the ceiling of its
+space (codes fitted to the full truth), and by the encoder's IoU from inputs with all faults at
+once. Training loss is not compared: the variants do not share one.
+
+A variant that is finished is not run again; one that was killed goes on from its checkpoint.
+Results: experiments/results/training_choices.json and .png. Time: about 4 minutes a variant on two
+quiet cores.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+
+from jaxshape.data.archives import list_meshes
+from jaxshape.data.config import DatasetConfig, InputConfig
+from jaxshape.data.dataset import (
+    TEST_SEEDS,
+    Dataset,
+    hash_seed,
+    is_noisy,
+    load_object,
+    open_dataset,
+    training_grids,
+)
+from jaxshape.data.inputs import draw_pair
+from jaxshape.data.meshes import Model, Skipped
+from jaxshape.files import atomic_path
+from jaxshape.model.autoencoder import decode, encode
+from jaxshape.model.config import Architecture, TrainConfig
+from jaxshape.model.training import finished_prior, train
+from jaxshape.model.weights import ShapePrior
+from jaxshape.refine.config import RefineConfig
+from jaxshape.results.evaluation import EvaluateConfig, evaluate, summarize
+from jaxshape.results.metrics import iou
+from jaxshape.results.pictures import COLORS
+
+RESULTS = Path(__file__).parent / "results"
+
+SMALL = Architecture(encoder=(8, 16, 32, 64), decoder=(32, 16, 8))
+FAULTLESS = InputConfig(complete=0, mirror=False, scale=0, pose_error=0, missing=0, segmentation=0)
+FAULTY = InputConfig(complete=0, scale=0.1, pose_error=0.3, missing=0.3, segmentation=0.1)
+"""Inputs of the test of robustness: every fault, more of each than in training."""
+
+# Each group changes one thing. The first of a group is what the others are compared with.
+PLAIN = TrainConfig(SMALL, FAULTLESS, occupied_weight=1.0)
+
+
+def _inputs(**changes: Any) -> TrainConfig:
+    return replace(PLAIN, inputs=replace(FAULTLESS, **changes))
+
+
+def _space(**changes: Any) -> TrainConfig:
+    return replace(PLAIN, architecture=replace(SMALL, **changes))
+
+
+VARIANTS: dict[str, TrainConfig] = {
+    "plain": PLAIN,
+    "single views": _inputs(max_views=1),
+    "1-4 views": _inputs(max_views=4),
+    "complete surfaces": _inputs(complete=0.1),
+    "mirror": _inputs(mirror=True),
+    "axis scale": _inputs(scale=0.1),
+    "pose error": _inputs(pose_error=0.1),
+    "missing regions": _inputs(missing=0.1),
+    "wrong masks": _inputs(segmentation=0.1),
+    "no sensor noise": PLAIN,
+    "box chairs": PLAIN,
+    "Adam": replace(PLAIN, optimizer="adam", learning_rate=1e-3),
+    "occupied x 1.5": replace(PLAIN, occupied_weight=1.5),
+    "occupied x 2": replace(PLAIN, occupied_weight=2.0),
+    "code 32": _space(code=32),
+    "code 64": _space(code=64),
+    "code 200": _space(code=200),
+    "decoder half": _space(decoder=(16, 8, 4)),
+    "decoder double": _space(decoder=(64, 32, 16)),
+    "code noise 0.1": replace(PLAIN, code_noise=0.1),
+    "code noise 0.3": replace(PLAIN, code_noise=0.3),
+    "KL 1": replace(PLAIN, code_noise=1.0, code_weight=1.0),
+}
+GROUPS = {
+    "inputs": ["plain", "single views", "1-4 views", "complete surfaces", "mirror", "axis scale",
+               "pose error", "missing regions", "wrong masks", "no sensor noise"],
+    "shapes": ["plain", "box chairs"],
+    "loss": ["plain", "occupied x 1.5", "occupied x 2", "Adam"],
+    "space": ["plain", "code 32", "code 64", "code 200", "decoder half", "decoder double",
+              "code noise 0.1", "code noise 0.3", "KL 1"],
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Config:
+    dataset: Path = Path("data/chairs")
+    """Folder made by `jaxshape dataset`; half of its objects are used, the noisy half or a mix."""
+    output: Path = Path("out/training_choices")
+    """Folder for the runs."""
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    """Those to train; the figures of the others are kept."""
+    steps: int = 200
+    """Batches of 32 pairs for each variant."""
+    chairs: int = 12
+    """Procedural test chairs."""
+    meshes: Path | None = None
+    """Folder of meshes to judge on too."""
+    every: int = 3
+    """Use every n-th of these meshes."""
+    iterations: int = 40
+    """Of the searches."""
+    boxes: Path | None = None
+    """Folder of a dataset of box chairs; without it that variant is left out."""
+    results: Path = RESULTS
+    smoke: bool = False
+    """Tiny networks, one step: seconds, to see that it runs."""
+
+
+# ------------------------------------------------------------------ one variant
+
+
+def examples(name: str, config: Config) -> Dataset:
+    """Half of the objects, the same for all variants but those that are about the objects."""
+    if name == "box chairs":
+        return open_dataset(config.boxes)
+    settings, dataset = DatasetConfig(), open_dataset(config.dataset)
+    clean = [i for i in range(len(dataset.names)) if not is_noisy(i, settings)]
+    rows = clean if name == "no sensor noise" else range(len(clean))
+    return dataset._replace(
+        names=[dataset.names[i] for i in rows], row=[dataset.row[i] for i in rows]
+    )
+
+
+def judge(
+    prior: ShapePrior, tests: dict[str, Sequence[Model]], faulty: tuple, config: Config
+) -> dict[str, Any]:
+    """IoU by frames and method, and ceiling, on each test set; and the encoder's with faults."""
+    search = RefineConfig(iterations=config.iterations)
+    scoring = EvaluateConfig((1, 4, 8), ("encoder", "cma", "gradient:adam"), ceiling=True,
+                             refine=search)  # fmt: skip
+    found: dict[str, Any] = {}
+    for name, models in tests.items():
+        scores = [s for s in evaluate(prior, models, scoring) if not isinstance(s, Skipped)]
+        found[name] = summarize(scores, scoring)
+    measured, surface = faulty
+    completed = jax.jit(lambda p, x: decode(p, encode(p, x)) > 0)(prior.params, measured)
+    found["faulty inputs"] = float(np.mean(iou(completed, surface)))
+    return found
+
+
+def faulty_pairs(models: Sequence[Model]) -> tuple[np.ndarray, np.ndarray]:
+    """Four inputs of each model with every fault at once, sensor noise included, and the truth."""
+    settings, pairs = DatasetConfig(noisy=1.0), []
+    for i, model in enumerate(models):
+        packed = training_grids(model.mesh, settings, hash_seed(7, i))
+        pairs += [draw_pair(packed, FAULTY, np.random.default_rng((i, k))) for k in range(4)]
+    measured, surface = zip(*pairs, strict=True)
+    return np.stack(measured), np.stack(surface)
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Train and judge every variant that has not been yet."""
+    path = config.results / "training_choices.json"
+    found = json.loads(path.read_text()) if path.exists() and not config.smoke else {}
+    chairs = [load_object(TEST_SEEDS + i) for i in range(config.chairs)]
+    tests: dict[str, Any] = {"procedural": chairs}
+    if config.meshes:
+        tests["meshes"] = [load_object(s) for s in list_meshes(config.meshes)[:: config.every]]
+    faulty = faulty_pairs(chairs)
+    for name in config.variants:
+        if name == "box chairs" and not config.boxes:
+            continue
+        settings = replace(VARIANTS[name], steps=config.steps)
+        if config.smoke:
+            tiny = Architecture((4, 4, 8, 8), (8, 8, 4), min(settings.architecture.code, 10))
+            settings = replace(settings, architecture=tiny, batch=4)
+        if found.get(name, {}).get("settings") == json.loads(json.dumps(asdict(settings))):
+            continue
+        folder, data = config.output / name.replace(" ", "-"), examples(name, config)
+        for report in train(folder, data, settings):
+            print(f"{name}: step {report.step}, loss {report.loss:.4f}, "
+                  f"{report.samples_per_second:.0f} samples/s", flush=True)  # fmt: skip
+        prior = finished_prior(folder, data, settings, samples=2048)
+        found[name] = judge(prior, tests, faulty, config) | {
+            "settings": asdict(settings), "samples": settings.steps * settings.batch
+        }  # fmt: skip
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(found, indent=1))
+        print(line(name, found[name]), flush=True)
+    return found
+
+
+def line(name: str, scores: dict[str, Any]) -> str:
+    """One variant's figures in a line, on the hardest test set."""
+    test = scores.get("meshes", scores["procedural"])
+    by_frames = [
+        f"{k}: " + "/".join(f"{test[k][m]['iou']:.3f}" for m in ("encoder", "cma", "gradient:adam"))
+        for k in ("1", "4", "8")
+    ]
+    return (
+        f"{name:18} encoder/CMA-ES/Adam from {', '.join(by_frames)} frames; "
+        f"ceiling {test['8']['bounds']['ceiling']:.3f}; faulty inputs {scores['faulty inputs']:.3f}"
+    )
+
+
+# ------------------------------------------------------------------ figure
+
+
+def plot(found: dict[str, Any], path: Path) -> None:
+    """A row of dots for each variant: each figure's difference from the plain variant."""
+    test = "meshes" if "meshes" in found["plain"] else "procedural"
+    figures = {
+        "encoder, 4 frames": lambda s: s[test]["4"]["encoder"]["iou"],
+        "CMA-ES, 4 frames": lambda s: s[test]["4"]["cma"]["iou"],
+        "Adam, 4 frames": lambda s: s[test]["4"]["gradient:adam"]["iou"],
+        "ceiling": lambda s: s[test]["8"]["bounds"]["ceiling"],
+        "encoder, faulty inputs": lambda s: s["faulty inputs"],
+    }
+    names = [n for group in GROUPS.values() for n in group[1:] if n in found]
+    fig, axes = plt.subplots(1, len(figures), sharey=True, figsize=(11, 0.3 * len(names) + 1.2))
+    for ax, (title, figure) in zip(axes, figures.items(), strict=True):
+        base = figure(found["plain"])
+        gains = np.array([figure(found[name]) - base for name in names])
+        rows = np.arange(len(names))[::-1]
+        ax.axvline(0, color="0.6", lw=0.8)
+        ax.hlines(rows, 0, gains, color=COLORS["measured"], lw=2)
+        ax.plot(gains, rows, "o", color=COLORS["measured"], ms=5)
+        ax.set_title(f"{title}\nplain: {base:.3f}", fontsize=9)
+        ax.set_yticks(rows, names, fontsize=9)
+        ax.tick_params(axis="x", labelsize=8)
+        ax.spines[["top", "right", "left"]].set_visible(False)
+        ax.grid(axis="x", color="0.92")
+        ax.set_axisbelow(True)
+    axes[len(axes) // 2].set_xlabel("IoU gained over the plain variant", fontsize=9)
+    fig.tight_layout()
+    with atomic_path(path) as temporary:
+        fig.savefig(temporary, dpi=150, format="png")
+    plt.close(fig)
+
+
+def main() -> None:
+    config = tyro.cli(Config)
+    if config.smoke:
+        config = replace(config, steps=1, chairs=2, iterations=2, meshes=None,
+                         variants=("plain", "code 32"), results=config.output)  # fmt: skip
+    found = run(config)
+    for name, scores in found.items():
+        print(line(name, scores))
+    plot(found, config.results / "training_choices.png")
+
+
+if __name__ == "__main__":
+    main()
