@@ -29,12 +29,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.config import DatasetConfig, InputConfig
@@ -115,7 +112,7 @@ GROUPS = {
 @dataclass(frozen=True)
 class Config:
     dataset: Path = Path("data/chairs")
-    """Folder made by `jaxshape dataset`; half of its objects are used, the noisy half or a mix."""
+    """Folder made by `jaxshape dataset`; half of its objects are used."""
     output: Path = Path("out/training_choices")
     """Folder for the runs."""
     variants: tuple[str, ...] = tuple(VARIANTS)
@@ -238,7 +235,8 @@ def plot(found: dict[str, Any], path: Path) -> None:
         "encoder, faulty inputs": lambda s: s["faulty inputs"],
     }
     names = [n for group in GROUPS.values() for n in group[1:] if n in found]
-    fig, axes = plt.subplots(1, len(figures), sharey=True, figsize=(11, 0.3 * len(names) + 1.2))
+    fig = Figure(figsize=(11, 0.3 * len(names) + 1.2))
+    axes = fig.subplots(1, len(figures), sharey=True)
     for ax, (title, figure) in zip(axes, figures.items(), strict=True):
         base = figure(found["plain"])
         gains = np.array([figure(found[name]) - base for name in names])
@@ -256,7 +254,6 @@ def plot(found: dict[str, Any], path: Path) -> None:
     fig.tight_layout()
     with atomic_path(path) as temporary:
         fig.savefig(temporary, dpi=150, format="png")
-    plt.close(fig)
 
 
 def main() -> None:

@@ -77,7 +77,11 @@ def training_grids(
 
 def is_noisy(index: int, config: DatasetConfig) -> bool:
     """Whether the depth images of an object, by its place among all, have a sensor's faults."""
-    return _draws_noise(config, hash_seed(config.seed, index))
+    return _draws_noise(config, _object_seed(config, index))
+
+
+def _object_seed(config: DatasetConfig, index: int) -> int:
+    return hash_seed(config.seed, index)
 
 
 def _draws_noise(config: DatasetConfig, seed: int) -> bool:
@@ -144,7 +148,7 @@ def _write_shard(
         if isinstance(model, Skipped):
             skipped.append(model)
             continue
-        seed = hash_seed(config.seed, number * OBJECTS_PER_SHARD + i)  # as in `is_noisy`
+        seed = _object_seed(config, number * OBJECTS_PER_SHARD + i)
         names.append(model.name)
         grids.append(training_grids(model.mesh, config, seed))
     shape = (0, 1 + config.views, RESOLUTION**3 // 8)

@@ -199,8 +199,8 @@ def train(
     mesh = jax.make_mesh((devices,), ("batch",))
     whole, spread = NamedSharding(mesh, P()), NamedSharding(mesh, P("batch"))
     share = partial(jax.make_array_from_process_local_data, whole)
-    state = jax.tree.map(share, _agreed_state(folder, config, start))
     run = _identity(config, start)
+    state = jax.tree.map(share, _agreed_state(folder, run, config, start))
     step_fn = _parallel_step(config, mesh)
     metrics, began = [], time.perf_counter()
     for step in range(int(state.step), config.steps):
@@ -260,7 +260,9 @@ def _identity(config: TrainConfig, start: ShapePrior | None) -> str:
     return json.dumps(asdict(config) | {"start": start and fingerprint(start)})
 
 
-def _agreed_state(folder: Path, config: TrainConfig, start: ShapePrior | None) -> TrainState:
+def _agreed_state(
+    folder: Path, run: str, config: TrainConfig, start: ShapePrior | None
+) -> TrainState:
     """The state of the checkpoint, or the initial one where there is none, for all processes.
 
     The first looks, for the others may not see its disk; they refuse what it refuses.
@@ -268,7 +270,7 @@ def _agreed_state(folder: Path, config: TrainConfig, start: ShapePrior | None) -
     share, is_first = multihost_utils.broadcast_one_to_all, jax.process_index() == 0
     path = folder / "checkpoint.safetensors"
     is_there = is_first and path.exists()
-    if share(is_there and _run_of(path) != _identity(config, start)):
+    if share(is_there and _run_of(path) != run):
         raise ValueError(
             f"{str(folder)!r} holds a training run of other settings; "
             "give the same ones to resume it, or another folder."
