@@ -1,7 +1,7 @@
 from .data.capture import Capture, capture, measure_frames
 from .data.chairs import random_chair
 from .data.meshes import load, read_meshes
-from .data.sequences import open_sequence
+from .data.sequences import Trajectory, open_sequence, read_trajectory, write_trajectory
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
@@ -48,6 +48,7 @@ __all__ = [
     "Target",
     "Tolerances",
     "Trace",
+    "Trajectory",
     "bounds",
     "build_refiner",
     "capture",
@@ -81,6 +82,7 @@ __all__ = [
     "random_views",
     "raw",
     "read_meshes",
+    "read_trajectory",
     "reconstruct",
     "refine",
     "refiner_for",
@@ -91,4 +93,5 @@ __all__ = [
     "whitened",
     "with_restarts",
     "write_mesh",
+    "write_trajectory",
 ]

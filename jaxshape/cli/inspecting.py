@@ -1,0 +1,160 @@
+"""`jaxshape inspect`: what a recording holds, and what may be wrong with it."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Say what a recording holds, and warn of what looks wrong, with the evidence and a remedy.
+
+    Example: jaxshape inspect scan/
+    """
+
+    frames: Positional[Path]
+    """Folder of the recording: 7-Scenes, TUM RGB-D, Redwood, Open3D, or rgb/ depth/ masks/ with
+    cam_K.txt."""
+    depth_scale: float | None = None
+    """Depth units in a metre; by default those of the layout."""
+    layout: Literal["7-scenes", "tum", "redwood", "bundlesdf", "open3d"] | None = None
+    """How the files lie; by default found out."""
+    json: bool = False
+    """Answer with one JSON object instead of a table."""
+
+    def run(self) -> None:
+        from jaxshape.data.sequences import open_sequence
+        from jaxshape.data.sequences.inspection import inspect_sequence
+
+        sequence = open_sequence(self.frames, depth_scale=self.depth_scale, layout=self.layout)
+        found = inspect_sequence(sequence)
+        if self.json:
+            print(json.dumps(as_json(sequence, found), indent=1))
+        else:
+            print_table(str(self.frames), sequence, found)
+
+
+def as_json(sequence: Any, found: Any) -> dict[str, Any]:
+    """All figures of a `Sequence` and its `Inspection`; lengths in metres, times in seconds."""
+    from jaxshape.data.sequences.cameras import intrinsic_numbers
+
+    times = sequence.times
+    return {
+        "layout": sequence.layout,
+        "frames": len(sequence),
+        "first": sequence.names[0],
+        "last": sequence.names[-1],
+        "height": sequence.shape[0],
+        "width": sequence.shape[1],
+        "intrinsics": dict(
+            zip(("fx", "fy", "cx", "cy"), intrinsic_numbers(sequence.intrinsics), strict=True)
+        ),
+        "camera": sequence.camera,
+        "depth_scale": sequence.depth_scale,
+        "depth": found.depths._asdict(),
+        "poses": None if found.poses is None else _pose_figures(found.poses),
+        "colors": found.colors,
+        "masks": found.masks,
+        "duration": None if times is None else float(times[-1] - times[0]),
+        "rate": found.rate,
+        "color_delay": _color_delay(sequence),
+        "gaps": [gap._asdict() for gap in found.gaps],
+        "warnings": [warning._asdict() for warning in found.warnings],
+    }
+
+
+def _pose_figures(poses: Any) -> dict[str, Any]:
+    from jaxshape.data.sequences.evidence import looks_inverted
+
+    return poses._asdict() | {
+        "agreement": poses.agreement._asdict(),
+        "look_inverted": looks_inverted(poses.agreement),
+    }
+
+
+def _color_delay(sequence: Any) -> dict[str, float] | None:
+    """Seconds between depth images and their colour: how many usually, and at most."""
+    import numpy as np
+
+    delays = () if sequence.color_delays is None else np.abs(sequence.color_delays)
+    known = [delay for delay in delays if np.isfinite(delay)]
+    return {"median": float(np.median(known)), "max": float(max(known))} if known else None
+
+
+def print_table(title: str, sequence: Any, found: Any) -> None:
+    """The figures as a table, then each warning as a sentence and what to do."""
+    console = Console()
+    table = Table(title=escape(title), show_header=False, title_justify="left")
+    for row in _rows(as_json(sequence, found)):
+        table.add_row(*map(escape, row))
+    console.print(table)
+    for evidence, advice in found.warnings:
+        sentence = evidence.rstrip(".")
+        console.print(f"[yellow]warning[/] {escape(f'{sentence}. {advice}')}", soft_wrap=True)
+
+
+def _rows(figures: dict[str, Any]) -> list[tuple[str, str]]:
+    count, depth, pixels = figures["frames"], figures["depth"], figures["intrinsics"]
+    size = f"{figures['width']} x {figures['height']}"
+    return [
+        ("layout", figures["layout"]),
+        ("frames", f"{count}, {figures['first']} to {figures['last']}, {size} pixels"),
+        ("time", _time_row(figures)),
+        ("gaps", _gap_row(figures["gaps"])),
+        ("camera", f"{_named(pixels)} ({figures['camera']})"),
+        (
+            "depth",
+            f"{figures['depth_scale']:g} units a metre: median {depth['median']:.2f} m; "
+            f"{depth['invalid']:.0%} invalid, {depth['saturated']:.0%} saturated "
+            f"({depth['sampled']} frames read)",
+        ),
+        ("poses", _pose_row(figures["poses"], count)),
+        ("colour", _color_row(figures, count)),
+        ("masks", f"{figures['masks']} of {count} frames" if figures["masks"] else "none"),
+    ]
+
+
+def _named(numbers: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.1f}" for name, value in numbers.items())
+
+
+def _time_row(figures: dict[str, Any]) -> str:
+    if figures["duration"] is None:
+        return "not given"
+    rate = f", {figures['rate']:.1f} frames a second" if figures["rate"] else ""
+    return f"{figures['duration']:.1f} s{rate}"
+
+
+def _gap_row(gaps: list[dict[str, Any]]) -> str:
+    shown = [f"{gap['missing']} after {gap['after']}" for gap in gaps[:3]]
+    more = [f"and {len(gaps) - 3} more"] if len(gaps) > 3 else []
+    return ", ".join(shown + more) or "none"
+
+
+def _pose_row(poses: dict[str, Any] | None, count: int) -> str:
+    if poses is None:
+        return "none: the camera has to be tracked"
+    given, inverted, pairs = poses["agreement"].values()
+    row = f"{poses['known']} of {count} frames, a way of {poses['length']:.2f} m; "
+    if not pairs:
+        return row + "too little motion to tell their direction"
+    direction = "world to camera" if poses["look_inverted"] else "camera to world"
+    return row + (
+        f"{direction}: {given:.0%} of the pixels of {pairs} pairs of frames agree, "
+        f"{inverted:.0%} if inverted"
+    )
+
+
+def _color_row(figures: dict[str, Any], count: int) -> str:
+    if not figures["colors"]:
+        return "none"
+    row, delay = f"{figures['colors']} of {count} frames", figures["color_delay"]
+    if delay is None:
+        return row
+    return f"{row}, {delay['median'] * 1e3:.0f} ms from depth, {delay['max'] * 1e3:.0f} at most"

@@ -1,0 +1,197 @@
+"""Read RGB-D recordings of the layouts people have. [host]
+
+A layout is two functions: whether a folder `fits` it, and one that lists the files of each frame.
+Images are read, and checked, one frame at a time when asked for, so a long sequence never fills the
+memory. Rooms, in the order of data: `frames` (what is read), `poses`, `trajectories`, `cameras`,
+`listing` (which images belong together), `seven_scenes`, `tum`, `folders` (the layouts), `evidence`
+(do the poses fit the images?), `figures` and `inspection` (what to know of a recording, and what to
+doubt).
+
+Depth images and colour images are taken as registered: of one camera, as all these layouts promise.
+A colour image of another size but the same aspect is scaled to the depth image.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxshape.data.sequences import folders, seven_scenes, tum
+from jaxshape.data.sequences.cameras import Camera, default_camera, find_camera, guessed
+from jaxshape.data.sequences.evidence import PoseAgreement as PoseAgreement
+from jaxshape.data.sequences.evidence import pose_agreement as pose_agreement
+from jaxshape.data.sequences.evidence import poses_look_inverted as poses_look_inverted
+from jaxshape.data.sequences.frames import Finding as Finding
+from jaxshape.data.sequences.frames import Frame as Frame
+from jaxshape.data.sequences.frames import FrameFiles as FrameFiles
+from jaxshape.data.sequences.frames import Sequence as Sequence
+from jaxshape.data.sequences.frames import SequenceError as SequenceError
+from jaxshape.data.sequences.frames import read_depth as read_depth
+from jaxshape.data.sequences.frames import read_shape, same_aspect, size
+from jaxshape.data.sequences.listing import Contents, Listed, list_folder
+from jaxshape.data.sequences.poses import check_rigid as check_rigid
+from jaxshape.data.sequences.trajectories import Pinhole as Pinhole
+from jaxshape.data.sequences.trajectories import Trajectory as Trajectory
+from jaxshape.data.sequences.trajectories import read_trajectory as read_trajectory
+from jaxshape.data.sequences.trajectories import write_trajectory as write_trajectory
+
+
+class Layout(NamedTuple):
+    """How one kind of recording lies on disk."""
+
+    needs: str
+    """The files it cannot do without, in a few words."""
+    fits: Callable[[Contents], bool]
+    list_frames: Callable[[Contents], Listed]
+
+
+LAYOUTS: dict[str, Layout] = {
+    "7-scenes": Layout("frame-N.depth.png", seven_scenes.fits, seven_scenes.list_frames),
+    "tum": Layout("depth.txt (lines of `time file`)", tum.fits, tum.list_frames),
+    "redwood": Layout("depth/N-TIME.png", folders.fits_redwood, folders.list_redwood),
+    "bundlesdf": Layout("depth/*.png, cam_K.txt", folders.fits_bundlesdf, folders.list_bundlesdf),
+    "open3d": Layout("depth/*.png", folders.fits_open3d, folders.list_open3d),
+}
+"""In the order in which a folder is tried against them: the last fits whatever has depth images."""
+
+
+def open_sequence(
+    path: str | Path, *, depth_scale: float | None = None, layout: str | None = None
+) -> Sequence:
+    """Open a folder of RGB-D frames without reading its images.
+
+    The `layout` is one of `LAYOUTS`, by default the first that fits; `depth_scale`, the depth units
+    in a metre, is by default that of the layout. Where the folder holds no camera, the one such
+    recordings are made with is taken, and `findings` say so if that is a guess.
+
+    Raises `SequenceError` where no layout fits, where files are missing, and for intrinsics that do
+    not fit the images; the images and poses are checked when their frame is read.
+    """
+    if depth_scale is not None and not depth_scale > 0:
+        raise SequenceError(
+            f"The depth scale is {depth_scale}; expected the number of depth units in a metre, "
+            "which is positive: 1000 for millimetres."
+        )
+    folder = Path(path)
+    if not folder.is_dir():
+        raise SequenceError(f"{folder} is not a folder; give the one that holds the recording.")
+    contents = list_folder(folder)
+    name = _layout_of(contents) if layout is None else _checked_layout(layout)
+    listed = LAYOUTS[name].list_frames(contents)
+    if not listed.files:
+        raise SequenceError(_nothing_fits(contents))
+    shape = _shape_of(listed)
+    camera, doubts = _camera(contents, listed, shape)
+    files, remarks = _without_other_colors(listed, shape)
+    return Sequence(
+        layout=name,
+        intrinsics=camera.intrinsics,
+        camera=camera.source,
+        files=files,
+        read_pose=listed.read_pose or _no_pose,
+        has_poses=listed.read_pose is not None,
+        shape=shape,
+        depth_scale=float(depth_scale or listed.depth_scale),
+        times=listed.times,
+        color_delays=listed.color_delays,
+        findings=listed.findings + doubts + remarks,
+    )
+
+
+def _no_pose(index: int) -> None:
+    del index
+
+
+# Which layout? ---------------------------------------------------------------------------------
+
+
+def _fitting(contents: Contents) -> str | None:
+    return next((name for name, layout in LAYOUTS.items() if layout.fits(contents)), None)
+
+
+def _layout_of(contents: Contents) -> str:
+    if (name := _fitting(contents)) is None:
+        raise SequenceError(_nothing_fits(contents))
+    return name
+
+
+def _checked_layout(name: str) -> str:
+    if name not in LAYOUTS:
+        raise SequenceError(f"There is no layout {name!r}; give one of {', '.join(LAYOUTS)}.")
+    return name
+
+
+def _nothing_fits(contents: Contents) -> str:
+    """What was found, what each layout needs, and a folder nearby that fits."""
+    folder, seen = contents.folder, sorted(contents.folders) + sorted(contents.files)
+    found = f"{', '.join(seen[:4])}{', ...' if len(seen) > 4 else ''}" if seen else "nothing"
+    needs = "; ".join(f"{name}: {layout.needs}" for name, layout in LAYOUTS.items())
+    nearby = _fitting_nearby(contents)
+    remedy = f"give {nearby}, which fits" if nearby else "give the folder that holds those"
+    return f"{folder} holds no recording but {found}; expected one of {needs}. Please {remedy}."
+
+
+def _fitting_nearby(contents: Contents) -> Path | None:
+    """A folder that fits: two levels of sub-folders, the first of many, then the parent."""
+    below = _subfolders(contents.folder)
+    deeper = (two for one in below for two in _subfolders(one))
+    nearby = (*below, *islice(deeper, 200), contents.folder.resolve().parent)
+    return next((one for one in nearby if _may_fit(one)), None)
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    with suppress(OSError):  # not ours to read
+        return [folder / name for name in sorted(list_folder(folder).folders)[:50]]
+    return []
+
+
+def _may_fit(folder: Path) -> bool:
+    with suppress(OSError):
+        return _fitting(list_folder(folder)) is not None
+    return False
+
+
+# What all images share -------------------------------------------------------------------------
+
+
+def _shape_of(listed: Listed) -> tuple[int, int]:
+    """Height and width of the first depth image whose header can be read."""
+    for files in listed.files[:20]:
+        with suppress(SequenceError):
+            return read_shape(files.depth)
+    return read_shape(listed.files[0].depth)  # raises what is wrong with it
+
+
+def _camera(
+    contents: Contents, listed: Listed, shape: tuple[int, int]
+) -> tuple[Camera, tuple[Finding, ...]]:
+    camera = find_camera(contents.folder, contents.files, shape)
+    if camera is not None:
+        return camera, ()
+    if listed.camera is None:
+        raise SequenceError(
+            f"camera-intrinsics.txt is missing; expected the 3x3 camera matrix in "
+            f"{contents.folder} or in its parent folder: write it there."
+        )
+    camera = default_camera(listed.camera, contents.folder, shape)
+    return camera, () if listed.camera.sure else (guessed(camera),)
+
+
+def _without_other_colors(
+    listed: Listed, shape: tuple[int, int]
+) -> tuple[tuple[FrameFiles, ...], tuple[Finding, ...]]:
+    """Leave out all colour images, if the first has another aspect than the depth images."""
+    first = next((files.color for files in listed.files if files.color), None)
+    try:
+        seen = read_shape(first) if first else shape
+    except SequenceError:  # a damaged image says nothing of the others
+        seen = shape
+    if same_aspect(seen, shape):
+        return listed.files, ()
+    finding = Finding(
+        f"colour images are {size(seen)} pixels and depth images {size(shape)}, another aspect, so "
+        "they do not show the same; colour is left out",
+        "Register the depth images to the colour images, or the other way round.",
+    )
+    return tuple(files._replace(color=None) for files in listed.files), (finding,)

@@ -1,0 +1,164 @@
+"""Intrinsics of a recording: found in its files, or those its kind of camera is known for.
+
+Ours put the centre of pixel (row, column) at (column + 0.5, row + 0.5); so does
+`camera-intrinsics.txt`, whose 640 x 480 images have their centre at 320, 240. OpenCV, and with it
+TUM, Open3D, Redwood and `cam_K.txt`, put it at (column, row), so theirs get half a pixel more.
+"""
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxshape.data.sequences.frames import Finding, SequenceError, same_aspect, size
+from jaxshape.data.sequences.poses import read_matrix
+
+Matrix = Float[np.ndarray, "3 3"]
+
+
+class Camera(NamedTuple):
+    """Intrinsics, and where they come from."""
+
+    intrinsics: Float[np.ndarray, "3 3"]
+    source: str
+
+
+class DefaultCamera(NamedTuple):
+    """What a kind of recording is known to be made with, where its folder holds no camera."""
+
+    numbers: tuple[float, float, float, float]
+    """fx, fy, cx, cy in OpenCV's pixels, of 640 x 480 images."""
+    source: str
+    sure: bool
+    """Whether it was calibrated for this very recording, or is a guess."""
+
+
+PRIMESENSE = (525.0, 525.0, 319.5, 239.5)
+"""Kinect 1 and Asus Xtion as their driver gives them, and the default of ROS and Open3D."""
+
+
+def find_camera(folder: Path, names: Iterable[str], shape: tuple[int, int]) -> Camera | None:
+    """The camera that lies in a folder, which holds `names`, or in its parent; None without one.
+
+    `camera-intrinsics.txt` or `cam_K.txt` (3x3), `calibration.txt` (fx fy cx cy), or a camera or
+    trajectory of Open3D, with "camera", "intrinsic" or "traj" in its name, scaled to `shape` if it
+    is of another size.
+    """
+    for name in sorted(names, key=lambda name: ("traj" in name, name)):
+        if name in _FILES:
+            return _camera(_FILES[name](folder / name), folder / name, shape)
+        if re.search(r"(camera|intrinsic|traj).*\.json$", name, re.IGNORECASE):
+            if (intrinsics := _read_json(folder / name, shape)) is not None:
+                return _camera(intrinsics, folder / name, shape)
+    for name, read in _FILES.items():
+        if (path := folder.resolve().parent / name).is_file():
+            return _camera(read(path), path, shape)
+    return None
+
+
+def _camera(K: Matrix, path: Path, shape: tuple[int, int]) -> Camera:
+    return Camera(_checked(K, path, shape), path.name)
+
+
+def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int]) -> Camera:
+    """A known camera, scaled to images of `shape`; `SequenceError` if it cannot have made them."""
+    if not same_aspect(shape, (480, 640)):
+        raise SequenceError(
+            f"{folder} holds no camera, and that of {default.source} makes images of 640 x 480, "
+            f"not of {size(shape)}; expected the 3x3 camera matrix: write it to cam_K.txt there."
+        )
+    intrinsics = np.diag([shape[1] / 640, shape[0] / 480, 1]) @ _from_opencv(*default.numbers)
+    return Camera(intrinsics, default.source)
+
+
+def guessed(camera: Camera) -> Finding:
+    """What to say of a camera that nothing vouches for."""
+    fx, fy, cx, cy = intrinsic_numbers(camera.intrinsics)
+    return Finding(
+        f"no camera file; focal lengths {fx:g}, {fy:g} and principal point {cx:g}, {cy:g} are "
+        f"those of {camera.source}",
+        "Write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt in the folder: 5 % of focal length bend "
+        "the surface and the way of the camera.",
+    )
+
+
+def intrinsic_numbers(K: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a camera matrix."""
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+
+
+def _from_opencv(fx: float, fy: float, cx: float, cy: float) -> Matrix:
+    return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
+
+
+def _read_ours(path: Path) -> Matrix:
+    return read_matrix(path, 3)
+
+
+def _read_opencv(path: Path) -> Matrix:
+    K = read_matrix(path, 3)
+    K[:2, 2] += 0.5
+    return K
+
+
+def _read_numbers(path: Path) -> Matrix:
+    """The first four numbers of a file, as ETH3D's SLAM benchmark writes them."""
+    try:
+        fx, fy, cx, cy = (float(word) for word in path.read_text().split()[:4])
+    except (OSError, ValueError) as error:
+        raise SequenceError(
+            f"{path} cannot be read as a camera ({error}); expected `fx fy cx cy`: write it again."
+        ) from error
+    return _from_opencv(fx, fy, cx, cy)
+
+
+_FILES: dict[str, Callable[[Path], Matrix]] = {
+    "camera-intrinsics.txt": _read_ours,
+    "cam_K.txt": _read_opencv,
+    "calibration.txt": _read_numbers,
+}
+
+
+def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
+    """Open3D's PinholeCameraIntrinsic, or the first of a trajectory; None if it is neither."""
+    try:
+        content: Any = json.loads(path.read_text())
+        if "parameters" in content:
+            content = next(iter(content["parameters"]), {}).get("intrinsic", {})
+        if "intrinsic_matrix" not in content:
+            return None
+        K = np.array(content["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
+        height, width = int(content.get("height", shape[0])), int(content.get("width", shape[1]))
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        raise SequenceError(
+            f"{path} cannot be read as a camera ({type(error).__name__}: {error}); expected "
+            "Open3D's JSON with width, height and intrinsic_matrix by columns: write it again."
+        ) from error
+    if not same_aspect((height, width), shape):
+        raise SequenceError(
+            f"{path} is of images of {width} x {height}, and the depth images are {size(shape)}; "
+            "expected the camera of the depth images: write theirs."
+        )
+    K[:2, 2] += 0.5
+    return np.diag([shape[1] / width, shape[0] / height, 1.0]) @ K
+
+
+def _checked(K: Matrix, path: Path, shape: tuple[int, int]) -> Matrix:
+    """The matrix, if it can be that of images of `shape`, else `SequenceError`."""
+    (h, w), (fx, fy, cx, cy) = shape, intrinsic_numbers(K)
+    if not (np.isfinite(K).all() and min(fx, fy) > 0 and np.array_equal(K[2], (0, 0, 1))):
+        raise SequenceError(
+            f"{path} has focal lengths {fx:g}, {fy:g} and last row {K[2].tolist()}; "
+            "expected positive focal lengths in pixels and 0 0 1: write fx 0 cx / 0 fy cy / 0 0 1."
+        )
+    # Within the middle 90 %, since a matrix for images of twice the size puts it at the corner.
+    if not all(0.05 < c / n < 0.95 for c, n in ((cx, w), (cy, h))):
+        raise SequenceError(
+            f"{path} has its principal point at {cx:g}, {cy:g}; expected it well "
+            f"inside the images of {size(shape)} pixels: scale the matrix with the images."
+        )
+    return K

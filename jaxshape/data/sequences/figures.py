@@ -1,0 +1,147 @@
+"""Figures of a recording: of its poses, names and times, and of some of its images."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxshape.data.sequences.evidence import PoseAgreement, pose_agreement, scale_agreement
+from jaxshape.data.sequences.frames import (
+    SATURATED,
+    Sequence,
+    SequenceError,
+    read_color,
+    read_mask,
+    read_raw_depth,
+)
+from jaxshape.data.sequences.listing import numbers_in
+
+SAMPLES = 12
+"""Frames, from all over a recording, whose images are read."""
+
+
+class Gap(NamedTuple):
+    """Frames that are missing, to judge by the numbers or times of those around them."""
+
+    after: str
+    before: str
+    missing: int
+
+
+class Depths(NamedTuple):
+    """Of all pixels of the sampled depth images."""
+
+    median: float
+    """Metres, of the valid pixels; 0 if there are none."""
+    invalid: float
+    """Share of pixels that hold nothing, from 0 to 1; `saturated` among them."""
+    saturated: float
+    sampled: int
+    """Images that could be read."""
+    black: int
+    """Of these, how many hold no valid pixel."""
+    damaged: tuple[str, ...]
+    """Of each image that could not be read, a sentence."""
+
+
+class Poses(NamedTuple):
+    """Of all frames."""
+
+    known: int
+    length: float
+    """Of the camera's way between frames with poses, metres."""
+    agreement: PoseAgreement
+    scales: dict[float, float]
+    """Depth scales, and the share of depth pixels that agree with neighbouring frames at each."""
+    damaged: tuple[str, ...]
+    """Of each pose that cannot be used, a sentence."""
+
+
+def depths_of(sequence: Sequence) -> Depths:
+    """Look at some depth images; raises the first's `SequenceError` if none can be read."""
+    raw, damaged = [], []
+    for index in _sampled(sequence):
+        try:
+            raw.append(read_raw_depth(sequence.files[index].depth, sequence.shape))
+        except SequenceError as error:
+            damaged.append(error)
+    if not raw:
+        raise damaged[0]
+    values = np.stack(raw)
+    valid = (values > 0) & (values < SATURATED)
+    return Depths(
+        median=float(np.median(values[valid])) / sequence.depth_scale if valid.any() else 0.0,
+        invalid=float(np.mean(~valid)),
+        saturated=float(np.mean(values >= SATURATED)),
+        sampled=len(raw),
+        black=int(np.sum(~valid.any(axis=(1, 2)))),
+        damaged=tuple(map(str, damaged)),
+    )
+
+
+def poses_of(sequence: Sequence) -> Poses | None:
+    """Read all poses, and compare some with the depth images; None where none were given."""
+    if not sequence.has_poses:
+        return None
+    places, damaged = [], []
+    for index in range(len(sequence)):
+        try:
+            if (T := sequence.read_pose(index)) is not None:
+                places.append(T[:3, 3])
+        except SequenceError as error:
+            damaged.append(str(error))
+    steps = np.linalg.norm(np.diff(np.reshape(places, (-1, 3)), axis=0), axis=1)
+    return Poses(
+        known=len(places),
+        length=float(steps.sum()),
+        agreement=pose_agreement(sequence),
+        scales=scale_agreement(sequence),
+        damaged=tuple(damaged),
+    )
+
+
+def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
+    """A sentence for each colour image or mask, of some, that cannot be used."""
+    damaged = []
+    for index in _sampled(sequence):
+        _, _, color, mask = sequence.files[index]
+        try:
+            if color is not None:
+                read_color(color, sequence.shape)
+            if mask is not None:
+                read_mask(mask, sequence.shape)
+        except SequenceError as error:
+            damaged.append(str(error))
+    return tuple(damaged)
+
+
+def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:
+    """Where frames are missing, by the times of the frames, or else by the numbers in their names.
+
+    A step between frames is a gap when it is half as long again as the usual one.
+    """
+    names = sequence.names
+    steps = np.diff(_numbers(names) if sequence.times is None else sequence.times)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if usual <= 0:  # names that do not count
+        return ()
+    return tuple(
+        Gap(names[i], names[i + 1], max(1, round(steps[i] / usual) - 1))
+        for i in np.flatnonzero(steps > 1.5 * usual)
+    )
+
+
+def _numbers(names: tuple[str, ...]) -> Float[np.ndarray, " n"]:
+    """The last number in each name; 0 without one."""
+    return np.array([(0, *numbers_in(name))[-1] for name in names], dtype=np.float64)
+
+
+def rate_of(sequence: Sequence) -> float | None:
+    """Depth images a second; None without times."""
+    steps = np.diff(sequence.times) if sequence.times is not None else np.zeros(0)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    return 1 / usual if usual > 0 else None
+
+
+def _sampled(sequence: Sequence) -> list[int]:
+    return np.unique(np.linspace(0, len(sequence) - 1, SAMPLES, dtype=int)).tolist()

@@ -1,0 +1,193 @@
+"""Layouts with a folder for each kind of image: Redwood object scans, BundleSDF, Open3D."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
+from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
+from jaxshape.data.sequences.listing import (
+    Contents,
+    Listed,
+    color_images,
+    depth_images,
+    files_in,
+    mask_images,
+    numbers_in,
+    partners,
+    with_colors_by_time,
+)
+from jaxshape.data.sequences.poses import read_pose
+from jaxshape.data.sequences.trajectories import read_trajectory
+
+MILLIMETRES = 1000.0
+
+_POSE_FOLDERS = {"poses": False, "pose": False, "ob_in_cam": True, "annotated_poses": True}
+"""Folders of 4x4 matrices, and whether they map the object to the camera, as BundleSDF's own."""
+
+_STAMPED = re.compile(r"\d+-\d+")
+
+PoseReader = Callable[[int], Float[np.ndarray, "4 4"] | None]
+
+
+# Redwood ---------------------------------------------------------------------------------------
+
+
+def fits_redwood(contents: Contents) -> bool:
+    depth = files_in(contents, ("depth",), (".png",)) if "depth" in contents.folders else {}
+    return bool(depth) and all(map(_STAMPED.fullmatch, depth))
+
+
+def list_redwood(contents: Contents) -> Listed:
+    """Object scans (Choi et al., 2016): `depth/N-TIME.png`, `rgb/N-TIME.jpg`, microseconds.
+
+    The streams are not synchronised: each depth image gets the colour image nearest in time. There
+    are no poses, unless someone put a trajectory beside the folders.
+    """
+    depth, offered = depth_images(contents), color_images(contents)
+    offered = {name: path for name, path in offered.items() if _STAMPED.fullmatch(name)}
+    times, color_times = _stamps(depth), _stamps(offered)
+    order = np.argsort(color_times, kind="stable")
+    paths = [list(offered.values())[i] for i in order]
+    color, delays = with_colors_by_time(times, color_times[order], paths)
+    masks = partners(depth, mask_images(contents))
+    return Listed(
+        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        depth_scale=MILLIMETRES,
+        read_pose=_trajectory_poses(contents, len(depth)),
+        times=times,
+        color_delays=delays if offered else None,
+        camera=DefaultCamera(PRIMESENSE, "the PrimeSense Carmine of all these scans", sure=True),
+    )
+
+
+def _stamps(names: dict[str, Path]) -> Float[np.ndarray, " n"]:
+    return np.array([numbers_in(name)[1] for name in names], dtype=np.float64) / 1e6
+
+
+# BundleSDF -------------------------------------------------------------------------------------
+
+
+def fits_bundlesdf(contents: Contents) -> bool:
+    return "depth" in contents.folders and "cam_K.txt" in contents.files
+
+
+def list_bundlesdf(contents: Contents) -> Listed:
+    """BundleSDF (Wen et al., CVPR 2023): `rgb/ depth/ masks/ cam_K.txt`, perhaps `poses/`.
+
+    `poses/N.txt` are camera to world; those of `ob_in_cam/` and `annotated_poses/`, the names that
+    BundleSDF uses itself, are object to camera, so the object's frame is then the world.
+    """
+    return _by_name(contents)._replace(camera=None)
+
+
+# Open3D ----------------------------------------------------------------------------------------
+
+
+def fits_open3d(contents: Contents) -> bool:
+    return "depth" in contents.folders
+
+
+def list_open3d(contents: Contents) -> Listed:
+    """Open3D's reconstruction system: `depth/`, `color/`, a trajectory, a camera.
+
+    Pose i of a `.log` belongs to the depth image that its header names, from 0.
+    """
+    return _by_name(contents)
+
+
+def _by_name(contents: Contents) -> Listed:
+    depth, offered = depth_images(contents), color_images(contents)
+    color = partners(depth, offered)
+    masks = partners(depth, mask_images(contents))
+    read = _pose_files(contents, list(depth)) or _trajectory_poses(contents, len(depth))
+    return Listed(
+        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        depth_scale=MILLIMETRES,
+        read_pose=read,
+        camera=DefaultCamera(PRIMESENSE, "Open3D's default, a PrimeSense", sure=False),
+        findings=_lone_colors(len(offered), color),
+    )
+
+
+def _lone_colors(offered: int, found: list[Path | None]) -> tuple[Finding, ...]:
+    used = sum(path is not None for path in found)
+    if not offered or used == len(found):
+        return ()
+    return (
+        Finding(
+            f"{len(found) - used} of {len(found)} depth images have no colour image of the same "
+            f"name or number, of {offered} there are",
+            "Give both the same names, if they were taken together.",
+        ),
+    )
+
+
+# Poses -----------------------------------------------------------------------------------------
+
+
+def _pose_files(contents: Contents, names: list[str]) -> PoseReader | None:
+    """Poses in files of their own, with the names or the numbers of the depth images."""
+    for folder, is_object_to_camera in _POSE_FOLDERS.items():
+        if offered := files_in(contents, (folder,), (".txt",)):
+            return _reader(partners(names, offered), is_object_to_camera)
+    return None
+
+
+def _reader(files: list[Path | None], is_object_to_camera: bool) -> PoseReader:
+    def read(index: int) -> Float[np.ndarray, "4 4"] | None:
+        T = read_pose(files[index])
+        return np.linalg.inv(T) if is_object_to_camera and T is not None else T
+
+    return read
+
+
+def _trajectory_poses(contents: Contents, count: int) -> PoseReader | None:
+    path = _find_trajectory(contents)
+    if path is None:
+        return None
+    trajectory = read_trajectory(path)
+    frames = trajectory.frames
+    if len(frames) and frames.max() >= count:
+        if len(frames) != count:
+            raise SequenceError(
+                f"{path} has poses of frames up to {frames.max()}, and there are {count} depth "
+                "images; expected the number of a depth image, from 0, before each pose: write "
+                "theirs."
+            )
+        frames = np.arange(count)
+    poses = dict(zip(frames.tolist(), trajectory.T_world_camera, strict=True))
+    return poses.get
+
+
+def _find_trajectory(contents: Contents) -> Path | None:
+    """The `.log` or `.json` that holds poses, those first that are called trajectory."""
+
+    def order(name: str) -> tuple[bool, str]:
+        return "traj" not in name.lower(), name
+
+    for name in sorted(contents.files, key=order):
+        path = contents.folder / name
+        if name.lower().endswith(".log") and _is_log(path):
+            return path
+        if name.lower().endswith(".json") and _is_json_trajectory(path):
+            return path
+    return None
+
+
+def _is_log(path: Path) -> bool:
+    with path.open(errors="replace") as file:
+        return re.fullmatch(r"\s*-?\d+\s+-?\d+\s+-?\d+\s*", file.readline(200)) is not None
+
+
+def _is_json_trajectory(path: Path) -> bool:
+    if "traj" in path.name.lower():  # if it is none, its reader says what is wrong with it
+        return True
+    try:
+        return "parameters" in json.loads(path.read_text())
+    except (ValueError, TypeError):
+        return False

@@ -1,0 +1,232 @@
+"""Frames of an RGB-D recording, read and checked one at a time, when they are asked for."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+
+SATURATED = 65535
+"""The value that depth cameras write where they measured nothing sure; read as 0, unknown."""
+
+USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 5000.0, 10000.0)
+"""Depth units per metre that people use."""
+
+_PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: what depth cameras reach, with room to spare
+_USUAL_MEDIAN_DEPTH = 2.0  # metres: an object in a room
+
+
+class SequenceError(ValueError):
+    """A sequence on disk is not what its layout promises; says which file, and what to do."""
+
+
+class Finding(NamedTuple):
+    """Something a user should know about a recording that can still be read."""
+
+    evidence: str
+    advice: str
+
+
+class Frame(NamedTuple):
+    """One RGB-D image."""
+
+    name: str
+    depth: Float[np.ndarray, "h w"]
+    """z along the optical axis in metres, float32; 0 where nothing was measured."""
+    color: UInt8[np.ndarray, "h w 3"] | None
+    """What the colour camera saw at the pixels of `depth`, scaled to its size."""
+    T_world_camera: Float[np.ndarray, "4 4"] | None
+    """None where no pose was given, or its own tracking was lost."""
+    mask: Bool[np.ndarray, "h w"] | None
+    """True on the object; None where no mask was given."""
+    time: float | None = None
+    """Of the depth image, in seconds from any start; None where the recording does not tell."""
+
+
+class FrameFiles(NamedTuple):
+    """Where the images of one frame lie."""
+
+    name: str
+    depth: Path
+    color: Path | None
+    mask: Path | None
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """A lazy sequence of frames: `len`, indexing and iteration read one frame at a time."""
+
+    layout: str
+    """Name of the layout on disk, a key of `LAYOUTS`."""
+    intrinsics: Float[np.ndarray, "3 3"]
+    """Of all depth images, in pixels, where column j covers u in [j, j + 1)."""
+    camera: str
+    """Where the intrinsics come from."""
+    files: tuple[FrameFiles, ...]
+    read_pose: Callable[[int], Float[np.ndarray, "4 4"] | None]
+    """Index of a frame, from 0, to its T_world_camera, checked; None where there is none."""
+    has_poses: bool
+    """Whether poses were given, though perhaps not of every frame."""
+    shape: tuple[int, int]
+    """Height and width which all images have when read, in pixels."""
+    depth_scale: float
+    """Depth units per metre."""
+    times: Float[np.ndarray, " n"] | None = None
+    """Of the depth images, in seconds; None where the recording does not tell."""
+    color_delays: Float[np.ndarray, " n"] | None = None
+    """Seconds from a depth image to its colour, NaN where it has none; None without times."""
+    findings: tuple[Finding, ...] = ()
+    """What was noticed on opening that a user should know."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(files.name for files in self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, index: int) -> Frame:
+        index = range(len(self))[index]
+        name, _, color, mask = self.files[index]
+        return Frame(
+            name=name,
+            depth=self.read_depth(index),
+            color=None if color is None else read_color(color, self.shape),
+            T_world_camera=self.read_pose(index),
+            mask=None if mask is None else read_mask(mask, self.shape),
+            time=None if self.times is None else float(self.times[index]),
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[index] for index in range(len(self)))
+
+    def read_depth(self, index: int) -> Float[np.ndarray, "h w"]:
+        """Read the depth image of one frame, and nothing else of it."""
+        return read_depth(self.files[index].depth, self.shape, depth_scale=self.depth_scale)
+
+
+# Depth -----------------------------------------------------------------------------------------
+
+
+def read_depth(
+    path: Path, shape: tuple[int, int], *, depth_scale: float
+) -> Float[np.ndarray, "h w"]:
+    """Read a 16-bit depth image as metres in float32; 0 where it holds 0 or 65535.
+
+    Raises `SequenceError` if the image is damaged, not 16 bit, not of height and width `shape`, or
+    if its median depth shows that `depth_scale` is wrong.
+    """
+    raw = read_raw_depth(path, shape)
+    valid = (raw > 0) & (raw < SATURATED)
+    depth = np.where(valid, raw / np.float32(depth_scale), np.float32(0))
+    if valid.any() and (fault := depth_scale_fault(float(np.median(depth[valid])), depth_scale)):
+        raise SequenceError(f"{path}: {fault.evidence}: {fault.advice}")
+    return depth
+
+
+def read_raw_depth(path: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w"]:
+    """Read the numbers of a 16-bit depth image, in its own units."""
+    with opened(path) as image:
+        if (image.height, image.width) != shape:
+            raise SequenceError(
+                f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the first depth "
+                "image: scale it to that size, or remove it."
+            )
+        if image.mode not in ("I;16", "I;16B", "I"):
+            raise SequenceError(
+                f"{path} has Pillow mode {image.mode}; expected a depth image with one channel of "
+                "16 bit: save it again without conversion."
+            )
+        return np.array(image, dtype=np.float32)
+
+
+def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
+    """What a median depth, in metres, says against the scale it was read with."""
+    low, high = _PLAUSIBLE_MEDIAN_DEPTH
+    if low <= median <= high:
+        return None
+    return Finding(
+        f"the median depth is {_readable_length(median)} at depth scale {depth_scale:g}; expected "
+        f"{low:g} to {high:g} m",
+        f"is --depth-scale {likely_depth_scale(median, depth_scale):g} meant?",
+    )
+
+
+def likely_depth_scale(median: float, depth_scale: float) -> float:
+    """Of the usual scales, the one at which a median depth becomes that of an object in a room."""
+    usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
+    return min(USUAL_DEPTH_SCALES, key=lambda scale: abs(np.log(scale / usual)))
+
+
+def _readable_length(metres: float) -> str:
+    if metres >= 1000:
+        return f"{metres / 1000:.3g} km"
+    return f"{metres:.3g} m" if metres >= 0.1 else f"{metres * 1000:.3g} mm"
+
+
+# Colour and masks ------------------------------------------------------------------------------
+
+
+def read_color(path: Path, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+    """Read a colour image, scaled to `shape`; `SequenceError` if damaged or of another aspect."""
+    with opened(path) as image:
+        _check_aspect(image, shape, path)
+        scaled = image.convert("RGB").resize((shape[1], shape[0]), Image.Resampling.BILINEAR)
+    return np.array(scaled)
+
+
+def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Read where an image is not black, scaled to `shape`; raises as `read_color` does."""
+    with opened(path) as image:
+        _check_aspect(image, shape, path)
+        opaque = image.convert("RGB") if image.mode in ("LA", "RGBA") else image
+        pixels = np.array(opaque.resize((shape[1], shape[0]), Image.Resampling.NEAREST))
+    return pixels != 0 if pixels.ndim == 2 else (pixels != 0).any(axis=-1)
+
+
+def _check_aspect(image: Image.Image, shape: tuple[int, int], path: Path) -> None:
+    if not same_aspect((image.height, image.width), shape):
+        raise SequenceError(
+            f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the depth images, or "
+            "that enlarged, so that both show the same: register it to the depth image, or remove "
+            "it."
+        )
+
+
+def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether images of two sizes can show the same, one scaled: their aspects differ by 2 %."""
+    return abs(a[0] * b[1] - a[1] * b[0]) <= 0.02 * a[1] * b[0]
+
+
+# Image files -----------------------------------------------------------------------------------
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """Open an image for the block that decodes it; `SequenceError` if it is damaged."""
+    try:
+        with Image.open(path) as image:
+            yield image
+    except (OSError, SyntaxError) as error:  # Pillow raises either for a damaged file
+        raise SequenceError(
+            f"{path} cannot be read as an image ({error}); expected a whole image file: copy it "
+            "again from its source, or remove the frame."
+        ) from error
+
+
+def read_shape(path: Path) -> tuple[int, int]:
+    """Height and width of an image, from its header alone."""
+    with opened(path) as image:
+        return image.height, image.width
+
+
+def size(shape: tuple[int, int]) -> str:
+    return f"{shape[1]} x {shape[0]}"
+
+
+def _size_of(image: Image.Image) -> str:
+    return size((image.height, image.width))

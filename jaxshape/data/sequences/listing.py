@@ -1,0 +1,133 @@
+"""What a folder holds, and which of its images belong together: by number, or by time."""
+
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxshape.data.sequences.cameras import DefaultCamera
+from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
+from jaxshape.data.sequences.poses import NEAR
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm")
+COLOR_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".ppm")
+
+
+class Contents(NamedTuple):
+    """A folder, listed once."""
+
+    folder: Path
+    files: frozenset[str]
+    folders: frozenset[str]
+
+
+class Listed(NamedTuple):
+    """What a layout finds in a folder, before any image is read."""
+
+    files: tuple[FrameFiles, ...]
+    depth_scale: float
+    read_pose: Callable[[int], Float[np.ndarray, "4 4"] | None] | None = None
+    """None where the recording has no poses."""
+    times: Float[np.ndarray, " n"] | None = None
+    color_delays: Float[np.ndarray, " n"] | None = None
+    camera: DefaultCamera | None = None
+    """Where the folder holds none."""
+    findings: tuple[Finding, ...] = ()
+
+
+def list_folder(folder: Path) -> Contents:
+    """List a folder; hidden entries are left out."""
+    files, folders = [], []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if not entry.name.startswith("."):
+                (folders if entry.is_dir() else files).append(entry.name)
+    return Contents(folder, frozenset(files), frozenset(folders))
+
+
+def files_in(
+    contents: Contents, names: Iterable[str], suffixes: tuple[str, ...]
+) -> dict[str, Path]:
+    """The files, by name without suffix, in the order of their numbers, of the first sub-folder of
+    `names` that there is; none without one."""
+    for name in names:
+        if name in contents.folders:
+            folder = contents.folder / name
+            found = (os.path.splitext(file) for file in list_folder(folder).files)
+            chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
+            return {stem: folder / (stem + end) for stem, end in sorted(chosen, key=_natural)}
+    return {}
+
+
+def depth_images(contents: Contents) -> dict[str, Path]:
+    """The images of the sub-folder `depth`; `SequenceError` if there are none."""
+    images = files_in(contents, ("depth",), DEPTH_SUFFIXES)
+    if not images:
+        raise SequenceError(
+            f"{contents.folder / 'depth'} holds no depth image; expected 16-bit PNG files: "
+            "copy them there."
+        )
+    return images
+
+
+def color_images(contents: Contents) -> dict[str, Path]:
+    return files_in(contents, ("color", "image", "rgb"), COLOR_SUFFIXES)
+
+
+def mask_images(contents: Contents) -> dict[str, Path]:
+    return files_in(contents, ("masks", "mask"), COLOR_SUFFIXES)
+
+
+# Which belong together -------------------------------------------------------------------------
+
+
+def numbers_in(name: str) -> tuple[int, ...]:
+    return tuple(int(digits) for digits in re.findall(r"\d+", name))
+
+
+def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | None]:
+    """For each name the file of the same name, else that with the same numbers in its name."""
+    by_number: dict[tuple[int, ...], Path | None] = {}
+    for name, path in offered.items():
+        by_number[numbers_in(name)] = None if numbers_in(name) in by_number else path
+    by_number[()] = None  # names without a number have to be the same
+    return [offered.get(name) or by_number.get(numbers_in(name)) for name in wanted]
+
+
+def nearest_in_time(
+    wanted: Float[np.ndarray, " n"], offered: Float[np.ndarray, " m"]
+) -> Int[np.ndarray, " n"]:
+    """Index of the reading nearest to each wanted time; -1 where even that is another moment.
+
+    That is when it is farther than half the usual time between readings, or `NEAR` if that is more.
+    `offered` rises.
+    """
+    if len(offered) == 0:
+        return np.full(len(wanted), -1)
+    later = np.clip(np.searchsorted(offered, wanted), 1, max(len(offered) - 1, 1))
+    pair = np.stack([later - 1, np.minimum(later, len(offered) - 1)])
+    nearer = np.abs(offered[pair] - wanted).argmin(axis=0)
+    index = np.take_along_axis(pair, nearer[None], axis=0)[0]
+    usual = float(np.median(np.diff(offered))) if len(offered) > 1 else 0.0
+    return np.where(np.abs(offered[index] - wanted) <= max(NEAR, usual / 2), index, -1)
+
+
+def with_colors_by_time(
+    times: Float[np.ndarray, " n"], offered: Float[np.ndarray, " m"], paths: list[Path]
+) -> tuple[list[Path | None], Float[np.ndarray, " n"]]:
+    """The colour image nearest to each time, and how much later it is, NaN where there is none."""
+    index = nearest_in_time(times, offered)
+    found = index >= 0
+    delays = np.full(len(times), np.nan)
+    delays[found] = offered[index[found]] - times[found]
+    return [paths[i] if i >= 0 else None for i in index], delays
+
+
+def _natural(item: tuple[str, str]) -> list[str | int]:
+    """Order by the numbers in a name, and where there are none, by its letters."""
+    words = re.split(r"(\d+)", "".join(item))
+    return [int(word) if i % 2 else word for i, word in enumerate(words)]

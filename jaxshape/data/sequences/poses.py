@@ -1,0 +1,118 @@
+"""Poses of a recording: matrices in files, what makes them rigid, and poses between two times."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxshape.data.sequences.frames import SequenceError
+
+READABLE_GAP = 0.1
+"""Seconds between two poses within which the camera's way is taken as straight."""
+
+NEAR = 0.02
+"""Seconds within which two readings are of the same moment, as in TUM's own tools."""
+
+
+def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
+    """Read a square matrix of `size` rows of numbers; `SequenceError` if it is anything else."""
+    try:
+        rows = [[number(word) for word in line.split()] for line in path.read_text().splitlines()]
+        matrix = np.array([row for row in rows if row], dtype=np.float64)
+        if matrix.shape != (size, size):
+            raise ValueError(f"its lines hold {[len(row) for row in rows]} numbers")
+    except (OSError, ValueError) as error:
+        raise SequenceError(
+            f"{path} is not a matrix ({error}); expected {size} lines of {size} numbers: write it "
+            "again."
+        ) from error
+    return matrix
+
+
+def number(word: str) -> float:
+    """A number from a text file, Windows' spellings of NaN and infinity, `-1.#IND`, among them."""
+    return np.nan if "#" in word else float(word)
+
+
+def read_pose(path: Path | None) -> Float[np.ndarray, "4 4"] | None:
+    """Read a 4x4 rigid motion; None without a file, or where it holds NaN or infinity.
+
+    7-Scenes writes such poses where its tracking was lost.
+    """
+    if path is None:
+        return None
+    return known(read_matrix(path, 4), path)
+
+
+def known(T: Float[np.ndarray, "4 4"], source: object) -> Float[np.ndarray, "4 4"] | None:
+    """A pose, checked; None where it is not finite, as recorders write them when they are lost."""
+    if not np.isfinite(T).all():
+        return None
+    check_rigid(T, source)
+    return T
+
+
+def is_rigid(T: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "*batch"]:
+    """Whether matrices are rigid motions, within what eight digits and rounding leave."""
+    R = T[..., :3, :3]
+    with np.errstate(invalid="ignore"):
+        last = np.abs(T[..., 3, :] - (0, 0, 0, 1)).max(axis=-1) <= 1e-6
+        orthonormal = _stretch(R) <= 1e-2
+        return np.asarray(last & orthonormal & (np.linalg.det(R) > 0))
+
+
+def check_rigid(T: Float[np.ndarray, "4 4"], source: object) -> None:
+    """Raise `SequenceError`, naming `source`, unless a matrix is a rigid motion."""
+    if is_rigid(T):
+        return
+    if not np.isfinite(T).all():
+        fault, remedy = "holds NaN or infinity", "remove it, if the camera was lost there"
+    elif np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-6:
+        fault = f"has the last row {T[3].tolist()}"
+        remedy = "transpose it if it is stored by columns"
+    elif (stretch := _stretch(T[:3, :3])) > 1e-2:
+        fault = f"has axes that are not orthonormal (R^T R differs from I by {stretch:.2g})"
+        remedy = "divide out its scale, or remove the frame"
+    else:
+        fault = "mirrors (its determinant is negative)"
+        remedy = "change the sign of one axis of the frame it maps to or from"
+    raise SequenceError(
+        f"{source} {fault}; expected a rigid motion with the last row 0 0 0 1: {remedy}."
+    )
+
+
+def _stretch(R: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
+    return np.asarray(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-2, -1)))
+
+
+def poses_at(
+    times: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"], wanted: Float[np.ndarray, " m"]
+) -> Callable[[int], Float[np.ndarray, "4 4"] | None]:
+    """Poses of a trajectory at other times: a function of the index into `wanted`.
+
+    `times` rise. Between two poses at most `READABLE_GAP` apart the position is interpolated and
+    the rotation along its geodesic; else the nearest is taken, if it is `NEAR`; else there is none.
+    """
+    later = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+
+    def pose(index: int) -> Float[np.ndarray, "4 4"] | None:
+        time, last = wanted[index], min(later[index], len(times) - 1)
+        a, b = max(last - 1, 0), last
+        if a < b and times[a] < time < times[b] <= times[a] + READABLE_GAP:
+            return _between(T[a], T[b], float((time - times[a]) / (times[b] - times[a])))
+        nearest = a if abs(times[a] - time) <= abs(times[b] - time) else b
+        return T[nearest] if abs(times[nearest] - time) <= NEAR else None
+
+    return pose
+
+
+def _between(
+    T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"], share: float
+) -> Float[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    turn = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([T_a[:3, :3], T_b[:3, :3]])))
+    T[:3, :3] = turn(share).as_matrix()
+    T[:3, 3] = (1 - share) * T_a[:3, 3] + share * T_b[:3, 3]
+    return T

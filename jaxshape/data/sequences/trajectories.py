@@ -1,0 +1,178 @@
+"""Trajectories in files: TUM's, Open3D's `.log` and `.json`, read and written."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from jaxshape.data.sequences.frames import SequenceError
+from jaxshape.data.sequences.poses import check_rigid, is_rigid, number
+from jaxshape.files import atomic_path
+
+
+class Trajectory(NamedTuple):
+    """The way of a camera."""
+
+    T_world_camera: Float[np.ndarray, "n 4 4"]
+    frames: Int[np.ndarray, " n"]
+    """Number of the frame, from 0, that each pose belongs to."""
+    times: Float[np.ndarray, " n"] | None = None
+    """Seconds; None where only the frames are known."""
+
+
+class Pinhole(NamedTuple):
+    """The camera of a trajectory, as `.json` holds it."""
+
+    intrinsics: Float[np.ndarray, "3 3"]
+    """In pixels, where column j covers u in [j, j + 1)."""
+    shape: tuple[int, int]
+    """Height and width, in pixels."""
+
+
+def read_trajectory(path: str | Path) -> Trajectory:
+    """Read a trajectory; its suffix tells the format, and anything but these two is TUM's.
+
+    `.log` (Redwood, Open3D): a line `frame frame frames`, then the 4x4 camera to world.
+    `.json` (Open3D's PinholeCameraTrajectory): 4x4 world to camera, by columns.
+    TUM: `time tx ty tz qx qy qz qw`, camera to world, a pose on each line; its poses are numbered
+    as they come. Poses that hold NaN, as some write them where they were lost, are left out.
+
+    Raises `SequenceError` where the file cannot be read, or a pose is not a rigid motion.
+    """
+    path = Path(path)
+    read = {".log": _read_log, ".json": _read_json}.get(path.suffix.lower(), _read_tum)
+    try:
+        trajectory = read(path.read_text())
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise SequenceError(
+            f"{path} cannot be read as a trajectory ({type(error).__name__}: {error}); expected "
+            "TUM's `time tx ty tz qx qy qz qw`, or Open3D's .log or .json: write it again."
+        ) from error
+    T = trajectory.T_world_camera
+    finite = np.isfinite(T).all(axis=(1, 2))
+    for bad in np.flatnonzero(finite & ~is_rigid(T)):
+        check_rigid(T[bad], f"Pose {bad} of {path}")
+    times = None if trajectory.times is None else trajectory.times[finite]
+    return Trajectory(T[finite], trajectory.frames[finite], times)
+
+
+def write_trajectory(
+    path: str | Path, trajectory: Trajectory, camera: Pinhole | None = None
+) -> None:
+    """Write a trajectory in the format of its suffix, as `read_trajectory` reads it.
+
+    `.json` needs the `camera`, since Open3D does. TUM's has times; without, the numbers of the
+    frames take their place.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".json" and camera is None:
+        raise ValueError(
+            f"{path} has no camera; Open3D's .json holds the camera of each pose: give it, or "
+            "write .log."
+        )
+    if suffix == ".json" and camera is not None:
+        text = _json_text(trajectory, camera)
+    else:
+        text = _log_text(trajectory) if suffix == ".log" else _tum_text(trajectory)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text)
+
+
+# TUM -------------------------------------------------------------------------------------------
+
+
+def _read_tum(text: str) -> Trajectory:
+    numbers = np.array(
+        [
+            [number(word) for word in line.replace(",", " ").split()[:8]]
+            for line in text.splitlines()
+            if line.strip() and not line.startswith("#")
+        ],
+        dtype=np.float64,
+    ).reshape(-1, 8)
+    quaternions, norms = numbers[:, 4:], np.linalg.norm(numbers[:, 4:], axis=1)
+    known = np.isfinite(numbers).all(axis=1)
+    if (known & (np.abs(norms - 1) > 1e-2)).any():
+        bad = int(np.flatnonzero(known & (np.abs(norms - 1) > 1e-2))[0])
+        raise ValueError(f"pose {bad} has a quaternion of length {norms[bad]:.3g}, not 1")
+    T = np.full((len(numbers), 4, 4), np.nan)
+    T[known] = np.eye(4)
+    if known.any():
+        T[known, :3, :3] = Rotation.from_quat(quaternions[known]).as_matrix()
+        T[known, :3, 3] = numbers[known, 1:4]
+    return Trajectory(T, np.arange(len(T)), numbers[:, 0])
+
+
+def _tum_text(trajectory: Trajectory) -> str:
+    T = trajectory.T_world_camera
+    times = trajectory.frames if trajectory.times is None else trajectory.times
+    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat() if len(T) else np.zeros((0, 4))
+    lines = [
+        f"{time:.6f} " + " ".join(f"{value:.9g}" for value in (*pose[:3, 3], *quaternion))
+        for time, pose, quaternion in zip(times, T, quaternions, strict=True)
+    ]
+    return "\n".join(["# time tx ty tz qx qy qz qw", *lines]) + "\n"
+
+
+# Open3D ----------------------------------------------------------------------------------------
+
+
+def _read_log(text: str) -> Trajectory:
+    words = [line.split() for line in text.splitlines() if line.strip()]
+    if len(words) % 5:
+        raise ValueError(f"it holds {len(words)} lines, not five for each pose")
+    T = np.array(
+        [[[number(w) for w in row] for row in words[i + 1 : i + 5]] for i in _fifth(words)]
+    )
+    frames = np.array([int(words[i][0]) for i in _fifth(words)], dtype=int)
+    if (np.diff(frames) <= 0).any():  # numbers of something else, such as fragments
+        frames = np.arange(len(frames))
+    return Trajectory(T.reshape(-1, 4, 4), frames)
+
+
+def _fifth(lines: list[Any]) -> range:
+    return range(0, len(lines), 5)
+
+
+def _log_text(trajectory: Trajectory) -> str:
+    lines = []
+    for frame, T in zip(trajectory.frames, trajectory.T_world_camera, strict=True):
+        lines.append(f"{frame} {frame} {frame + 1}")
+        lines.extend(" ".join(f"{value:.9g}" for value in row) for row in T)
+    return "".join(line + "\n" for line in lines)
+
+
+def _read_json(text: str) -> Trajectory:
+    parameters = json.loads(text)["parameters"]
+    by_columns = np.array([one["extrinsic"] for one in parameters], dtype=np.float64)
+    T_camera_world = np.swapaxes(by_columns.reshape(-1, 4, 4), 1, 2)
+    finite = np.isfinite(T_camera_world).all(axis=(1, 2))
+    T = np.full_like(T_camera_world, np.nan)
+    T[finite] = np.linalg.inv(T_camera_world[finite])
+    return Trajectory(T, np.arange(len(T)))
+
+
+def _json_text(trajectory: Trajectory, camera: Pinhole) -> str:
+    K = camera.intrinsics.copy()
+    K[:2, 2] -= 0.5  # Open3D counts from the centre of the first pixel
+    intrinsic = {
+        "height": camera.shape[0],
+        "intrinsic_matrix": K.T.ravel().tolist(),
+        "width": camera.shape[1],
+    }
+    version = {"version_major": 1, "version_minor": 0}
+    parameters = [
+        {
+            "class_name": "PinholeCameraParameters",
+            "extrinsic": np.linalg.inv(T).T.ravel().tolist(),
+            "intrinsic": intrinsic,
+            **version,
+        }
+        for T in trajectory.T_world_camera
+    ]
+    content = {"class_name": "PinholeCameraTrajectory", "parameters": parameters, **version}
+    return json.dumps(content, indent=1) + "\n"

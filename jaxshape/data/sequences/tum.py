@@ -1,0 +1,96 @@
+"""TUM RGB-D (Sturm et al., IROS 2012): lists of images and poses, each with its time."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
+from jaxshape.data.sequences.frames import FrameFiles, SequenceError
+from jaxshape.data.sequences.listing import (
+    Contents,
+    Listed,
+    mask_images,
+    partners,
+    with_colors_by_time,
+)
+from jaxshape.data.sequences.poses import known, poses_at
+from jaxshape.data.sequences.trajectories import read_trajectory
+
+_CALIBRATED = {
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
+}
+"""fx, fy, cx, cy of the colour cameras, to which depth is registered, by the benchmark."""
+
+
+def fits(contents: Contents) -> bool:
+    return "depth.txt" in contents.files
+
+
+def list_frames(contents: Contents) -> Listed:
+    """`depth.txt`, and perhaps `rgb.txt` and `groundtruth.txt`, whose clocks are the same.
+
+    Each depth image gets the colour image nearest in time, and the pose between those before and
+    after it.
+    """
+    folder = contents.folder
+    times, depth = _read_list(folder / "depth.txt")
+    if not depth:
+        raise SequenceError(
+            f"{folder / 'depth.txt'} lists no image; expected lines of `time file`: write them."
+        )
+    color_times, offered = np.zeros(0), []
+    if "rgb.txt" in contents.files:
+        color_times, offered = _read_list(folder / "rgb.txt")
+    color, delays = with_colors_by_time(times, color_times, offered)
+    names = [path.stem for path in depth]
+    masks = partners(names, mask_images(contents))
+    return Listed(
+        files=tuple(map(FrameFiles, names, depth, color, masks)),
+        depth_scale=5000.0,
+        read_pose=_poses(folder / "groundtruth.txt", times),
+        times=times,
+        color_delays=delays if offered else None,
+        camera=_camera_of(folder),
+    )
+
+
+def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
+    """Times, rising, and images of lines `time file`."""
+    try:
+        words = [line.split(maxsplit=1) for line in path.read_text().splitlines()]
+        pairs = sorted((float(w[0]), w[1].strip()) for w in words if w and not w[0].startswith("#"))
+    except (OSError, ValueError, IndexError) as error:
+        raise SequenceError(
+            f"{path} is not a list of images ({error}); expected lines of `time file`: write it "
+            "again."
+        ) from error
+    return np.array([time for time, _ in pairs]), [path.parent / file for _, file in pairs]
+
+
+def _poses(path: Path, times: Float[np.ndarray, " n"]):
+    if not path.is_file():
+        return None
+    trajectory = read_trajectory(path)
+    if trajectory.times is None or len(trajectory.times) == 0:
+        return None
+    order = np.argsort(trajectory.times, kind="stable")
+    pose = poses_at(trajectory.times[order], trajectory.T_world_camera[order], times)
+
+    def read(index: int) -> Float[np.ndarray, "4 4"] | None:
+        T = pose(index)
+        return None if T is None else known(T, path)
+
+    return read
+
+
+def _camera_of(folder: Path) -> DefaultCamera:
+    names = f"{folder.resolve().parent.name}/{folder.resolve().name}"
+    which = re.search(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)", names, re.IGNORECASE)
+    if which:
+        source = f"TUM's calibration of freiburg{which[1]}"
+        return DefaultCamera(_CALIBRATED[which[1]], source, sure=True)
+    return DefaultCamera(PRIMESENSE, "the default of ROS for a Kinect", sure=False)

@@ -1,0 +1,166 @@
+"""Each fault of a recording is noticed, with its evidence; a good recording is not accused."""
+
+import re
+
+import numpy as np
+import pytest
+from recordings import WRITERS, H, K, W, record, save, write_7_scenes, write_redwood, write_tum
+from scipy.spatial.transform import Rotation
+
+from jaxshape.data.sequences import SequenceError, open_sequence
+from jaxshape.data.sequences.figures import Gap
+from jaxshape.data.sequences.inspection import inspect_sequence
+
+SEEN = record(12)
+
+
+def inspect(folder, **settings):
+    return inspect_sequence(open_sequence(folder, **settings))
+
+
+def warnings_of(folder, **settings):
+    return [" ".join(warning) for warning in inspect(folder, **settings).warnings]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_good_recording(tmp_path, name):
+    WRITERS[name](tmp_path, SEEN)
+    found = inspect(tmp_path)
+    assert found.warnings == () and found.gaps == ()
+    assert (found.colors, found.masks) == (12, 12)
+    assert found.depths.median == pytest.approx(np.median(SEEN.depth))
+    assert found.depths[1:] == (0, 0, 12, 0, ())
+    steps = np.diff(SEEN.T_world_camera[:, :3, 3], axis=0)
+    assert found.poses.known == 12 and found.poses.damaged == ()
+    assert found.poses.length == pytest.approx(np.linalg.norm(steps, axis=1).sum(), rel=1e-4)
+    assert found.poses.agreement.as_given > 0.8
+    assert found.rate == (pytest.approx(30, rel=1e-3) if name in ("tum", "redwood") else None)
+
+
+@pytest.mark.parametrize("written, read", [(1000, 1.0), (5000, 1000.0), (1000, 5000.0)])
+def test_poses_tell_a_wrong_depth_scale(tmp_path, written, read):
+    write_7_scenes(tmp_path, SEEN, scale=written)
+    (warning,) = warnings_of(tmp_path, depth_scale=read)
+    said = rf"depth scale {written}, where 8\d% .* not at {read:g}, where \d+% .* {written} meant"
+    assert re.search(said, warning)
+
+
+@pytest.mark.parametrize(
+    "written, read, said",
+    [
+        (1000, 1.0, "3 km at depth scale 1; expected 0.1 to 20 m Is --depth-scale 1000 meant"),
+        (4000, 1000.0, "12 m at depth scale 1000; .* 0.3 to 7 m .* --depth-scale 5000 it would be"),
+        (1000, 5000.0, None),
+    ],
+)
+def test_without_poses_the_median_depth_tells_or_not(tmp_path, written, read, said):
+    write_redwood(tmp_path, SEEN, scale=written, poses=False)
+    warnings = warnings_of(tmp_path, depth_scale=read)
+    assert len(warnings) == (said is not None)
+    assert said is None or re.search(said, warnings[0])
+
+
+def test_inverted_poses_with_both_shares(tmp_path):
+    write_7_scenes(tmp_path, SEEN._replace(T_world_camera=np.linalg.inv(SEEN.T_world_camera)))
+    (warning,) = warnings_of(tmp_path)
+    assert re.search(r"world to camera: \d\d% of the pixels .* inverted, \d+% as given", warning)
+
+
+def test_poses_of_another_recording(tmp_path):
+    turned = Rotation.from_euler("y", np.arange(12)[:, None] ** 2).as_matrix()
+    T = SEEN.T_world_camera.copy()
+    T[:, :3, :3] = turned
+    write_7_scenes(tmp_path, SEEN._replace(T_world_camera=T))
+    assert any("fit the depth images badly" in warning for warning in warnings_of(tmp_path))
+
+
+def test_poses_that_are_missing_or_not_rigid(tmp_path):
+    write_7_scenes(tmp_path, SEEN)
+    (tmp_path / "frame-000004.pose.txt").unlink()
+    assert any("1 of 12 frames have no pose" in warning for warning in warnings_of(tmp_path))
+    np.savetxt(tmp_path / "frame-000005.pose.txt", np.diag([2.0, 1, 1, 1]))
+    found = inspect(tmp_path)
+    assert found.poses.known == 10 and len(found.poses.damaged) == 1
+    assert any("frame-000005.pose.txt" in warning.evidence for warning in found.warnings)
+
+
+def test_gaps_of_numbers_and_of_times(tmp_path):
+    write_7_scenes(tmp_path / "a", SEEN)
+    for number in (3, 4, 8):
+        (tmp_path / f"a/frame-{number:06d}.depth.png").unlink()
+        (tmp_path / f"a/frame-{number:06d}.pose.txt").unlink()
+    assert inspect(tmp_path / "a").gaps == (
+        Gap("frame-000002", "frame-000005", 2),
+        Gap("frame-000007", "frame-000009", 1),
+    )
+    assert any(
+        "missing frames: 3, the most (2) between" in warning
+        for warning in warnings_of(tmp_path / "a")
+    )
+    write_redwood(tmp_path / "b", SEEN, poses=False)
+    for path in sorted((tmp_path / "b/depth").iterdir())[4:6]:
+        path.unlink()
+    (gap,) = inspect(tmp_path / "b").gaps
+    assert gap.missing == 2 and gap.after.startswith("0000004-")
+
+
+def test_every_fifth_frame_is_no_gap(tmp_path):
+    write_7_scenes(tmp_path, SEEN)
+    for path in sorted(tmp_path.glob("frame-*"), reverse=True):
+        stem, end = path.name.split(".", 1)
+        path.rename(tmp_path / f"frame-{5 * int(stem[6:]):06d}.{end}")
+    assert inspect(tmp_path).gaps == ()
+
+
+def test_damaged_black_and_saturated_images(tmp_path):
+    write_7_scenes(tmp_path, SEEN)
+    (tmp_path / "frame-000002.depth.png").write_bytes(b"")
+    save(tmp_path / "frame-000003.depth.png", np.zeros((H, W), np.uint16))
+    for number in range(4, 10):
+        save(tmp_path / f"frame-{number:06d}.depth.png", np.full((H, W), 65535, np.uint16))
+    found = inspect(tmp_path)
+    assert found.depths.invalid == pytest.approx(7 / 11)
+    assert found.depths.saturated == pytest.approx(6 / 11)
+    warnings = " ".join(warning.evidence for warning in found.warnings)
+    assert "sampled depth images that cannot be used: 1; " in warnings
+    assert "7 of 11 sampled depth images hold no valid depth" in warnings
+    assert "64% of the depth pixels hold nothing, 55% are saturated" in warnings
+
+
+def test_damaged_colours_and_masks(tmp_path):
+    write_7_scenes(tmp_path, SEEN)
+    (tmp_path / "frame-000002.color.png").write_bytes(b"")
+    (tmp_path / "frame-000003.mask.png").write_bytes(b"")
+    (warning,) = warnings_of(tmp_path)
+    assert "cannot be used: 2; " in warning and "frame-000002.color.png" in warning
+
+
+def test_images_that_cannot_be_read_at_all(tmp_path):
+    for number in range(3):
+        save(tmp_path / f"frame-{number}.depth.png", np.full((H, W), 200, np.uint8))
+    np.savetxt(tmp_path / "camera-intrinsics.txt", K)
+    with pytest.raises(SequenceError, match="frame-0.depth.png has Pillow mode L"):
+        inspect(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ([[1, 1, 0.6], [1, 1, 1], [1, 1, 1]], "principal point 19.2, 24.0 is far from the centre"),
+        ([[4, 1, 1], [1, 4, 1], [1, 1, 1]], "makes the images 15 degrees wide"),
+        ([[1, 1, 1], [1, 1.2, 1], [1, 1, 1]], "focal lengths 60.0 and 72.0 differ"),
+    ],
+)
+def test_cameras_that_are_unlikely(tmp_path, change, said):
+    write_7_scenes(tmp_path, SEEN)
+    np.savetxt(tmp_path / "camera-intrinsics.txt", K * change)
+    assert any(said in warning for warning in warnings_of(tmp_path))
+
+
+def test_colours_of_other_times_and_without_depth(tmp_path):
+    write_tum(tmp_path, SEEN)
+    lines = (tmp_path / "rgb.txt").read_text().splitlines()
+    (tmp_path / "rgb.txt").write_text("\n".join(lines[:6]))
+    assert any(
+        "8 of 12 depth images have no colour" in warning for warning in warnings_of(tmp_path)
+    )

@@ -1,0 +1,349 @@
+"""One scene, written in every layout, is read as the same frames."""
+
+import json
+import shutil
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageFile
+from recordings import (
+    WRITERS,
+    H,
+    K,
+    W,
+    raw,
+    record,
+    save,
+    write_7_scenes,
+    write_bundlesdf,
+    write_open3d,
+    write_redwood,
+    write_tum,
+)
+
+from jaxshape.data.sequences import LAYOUTS, SequenceError, open_sequence
+
+SEEN = record()
+
+
+def fault_of(folder, **settings):
+    with pytest.raises(SequenceError) as caught:
+        list(open_sequence(folder, **settings))
+    return str(caught.value)
+
+
+# What is read is what was written --------------------------------------------------------------
+
+
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 2**16), count=st.integers(1, 12))
+def test_every_layout_gives_the_same_frames(tmp_path_factory, seed, count):
+    seen = record(count, seed)
+    for name, write in WRITERS.items():
+        folder = tmp_path_factory.mktemp("recording")
+        write(folder, seen)
+        sequence = open_sequence(folder)
+        assert sequence.layout == name.split()[0] and len(sequence) == count, name
+        assert sequence.has_poses and not sequence.findings
+        np.testing.assert_allclose(sequence.intrinsics, K, err_msg=name)
+        for i, frame in enumerate(sequence):
+            np.testing.assert_allclose(frame.depth, seen.depth[i], rtol=1e-6, err_msg=name)
+            np.testing.assert_array_equal(frame.color, seen.color[i], err_msg=name)
+            np.testing.assert_array_equal(frame.mask, seen.mask[i], err_msg=name)
+            np.testing.assert_allclose(frame.T_world_camera, seen.T_world_camera[i], atol=1e-6)
+        shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_times_of_the_layouts_that_have_them(tmp_path, name):
+    WRITERS[name](tmp_path, SEEN)
+    sequence = open_sequence(tmp_path)
+    if name in ("tum", "redwood"):
+        start = 100 if name == "tum" else 0
+        np.testing.assert_allclose(sequence.times, SEEN.times - 100 + start, atol=1e-5)
+        np.testing.assert_allclose(sequence.color_delays, 0.01, atol=1e-5)
+        assert sequence[2].time == sequence.times[2]
+    else:
+        assert sequence.times is None and sequence.color_delays is None
+        assert sequence[2].time is None
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_depth_scale_of_ones_own(tmp_path, name):
+    WRITERS[name](tmp_path, SEEN, scale=2000)
+    sequence = open_sequence(tmp_path, depth_scale=2000.0)
+    np.testing.assert_allclose(sequence[1].depth, SEEN.depth[1], rtol=1e-6)
+    assert open_sequence(tmp_path).depth_scale == (5000 if name == "tum" else 1000)
+
+
+def test_a_layout_can_be_asked_for(tmp_path):
+    write_redwood(tmp_path, SEEN)
+    assert open_sequence(tmp_path, layout="bundlesdf").layout == "bundlesdf"
+    assert "no layout 'kinect'; give one of 7-scenes, tum" in fault_of(tmp_path, layout="kinect")
+
+
+# Redwood and TUM: streams with times of their own ----------------------------------------------
+
+
+def test_colours_are_paired_by_time_and_dropped_ones_are_missing(tmp_path):
+    write_redwood(tmp_path, SEEN, color_delay=0.012)
+    sorted((tmp_path / "rgb").iterdir())[2].unlink()
+    sequence = open_sequence(tmp_path)
+    colors = [frame.color for frame in sequence]
+    assert [color is None for color in colors] == [False, False, True, False, False, False]
+    for i in (0, 1, 3, 4, 5):
+        np.testing.assert_array_equal(colors[i], SEEN.color[i])
+    assert np.isnan(sequence.color_delays[2])
+
+
+def test_a_redwood_scan_as_it_comes_has_neither_poses_nor_a_camera_file(tmp_path):
+    write_redwood(tmp_path, SEEN, poses=False)
+    (tmp_path / "cam_K.txt").unlink()
+    sequence = open_sequence(tmp_path)
+    assert not sequence.has_poses and sequence[0].T_world_camera is None
+    known = np.array([[52.5, 0, 32], [0, 52.5, 24], [0, 0, 1]])
+    np.testing.assert_allclose(sequence.intrinsics, known)
+    assert "Carmine" in sequence.camera and not sequence.findings
+
+
+@pytest.mark.parametrize(
+    "folder, fx, cx, source",
+    [
+        ("rgbd_dataset_freiburg1_desk", 517.3, 319.1, "freiburg1"),
+        ("fr2_xyz", 520.9, 325.6, "freiburg2"),
+        ("my_fr3", 535.4, 320.6, "freiburg3"),
+        ("office", 525.0, 320.0, "default of ROS"),
+    ],
+)
+def test_tum_cameras_are_known_by_the_name_of_the_folder(tmp_path, folder, fx, cx, source):
+    write_tum(tmp_path / folder, SEEN)
+    (tmp_path / folder / "calibration.txt").unlink()
+    sequence = open_sequence(tmp_path / folder)
+    assert source in sequence.camera
+    np.testing.assert_allclose(sequence.intrinsics[0], [fx / 10, 0, cx / 10])
+    assert [len(sequence.findings), "ROS" in sequence.camera] in ([0, False], [1, True])
+
+
+def test_tum_poses_between_and_outside_those_given(tmp_path):
+    write_tum(tmp_path, SEEN)
+    path = tmp_path / "groundtruth.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:3], *lines[4:]]))  # the pose at frame 2 is lost
+    T = open_sequence(tmp_path)[2].T_world_camera
+    np.testing.assert_allclose(T, SEEN.T_world_camera[2], atol=1e-5)  # even motion: half way
+    path.write_text("\n".join(lines[:3]))
+    poses = [frame.T_world_camera is not None for frame in open_sequence(tmp_path)]
+    assert poses == [True, True, False, False, False, False]
+
+
+def test_tum_without_colours_or_poses(tmp_path):
+    write_tum(tmp_path, SEEN, poses=False)
+    (tmp_path / "rgb.txt").unlink()
+    sequence = open_sequence(tmp_path)
+    assert not sequence.has_poses and sequence[0].color is None and sequence.color_delays is None
+
+
+# Poses -----------------------------------------------------------------------------------------
+
+
+def test_frames_without_a_pose(tmp_path):
+    write_open3d(tmp_path / "a", SEEN)
+    lines = (tmp_path / "a/trajectory.log").read_text().splitlines()
+    (tmp_path / "a/trajectory.log").write_text("\n".join(lines[:5] + lines[15:20]))
+    poses = [frame.T_world_camera is not None for frame in open_sequence(tmp_path / "a")]
+    assert poses == [True, False, False, True, False, False]
+    write_bundlesdf(tmp_path / "b", SEEN)
+    (tmp_path / "b/ob_in_cam/00002.txt").unlink()
+    poses = [frame.T_world_camera is not None for frame in open_sequence(tmp_path / "b")]
+    assert poses == [True, True, False, True, True, True]
+
+
+def test_poses_of_other_frames_than_there_are(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    for name in ("depth/depth_5.png", "depth/depth_4.png"):
+        (tmp_path / name).unlink()
+    assert "poses of frames up to 5, and there are 4 depth images" in fault_of(tmp_path)
+
+
+def test_poses_of_bundlesdf_may_be_camera_to_world(tmp_path):
+    write_bundlesdf(tmp_path, SEEN)
+    shutil.rmtree(tmp_path / "ob_in_cam")
+    assert not open_sequence(tmp_path).has_poses
+    (tmp_path / "poses").mkdir()
+    np.savetxt(tmp_path / "poses/3.txt", SEEN.T_world_camera[3])
+    np.testing.assert_allclose(open_sequence(tmp_path)[3].T_world_camera, SEEN.T_world_camera[3])
+
+
+def test_a_trajectory_of_poses_alone_says_nothing_of_the_camera(tmp_path):
+    write_open3d(tmp_path, SEEN, as_json=True)
+    path = tmp_path / "trajectory.json"
+    parameters = [
+        {"extrinsic": one["extrinsic"]} for one in json.loads(path.read_text())["parameters"]
+    ]
+    path.write_text(json.dumps({"parameters": parameters}))
+    sequence = open_sequence(tmp_path)
+    assert sequence.has_poses and "no camera file" in sequence.findings[0].evidence
+    path.write_text("[]")
+    assert "cannot be read as a" in fault_of(tmp_path)
+
+
+def test_a_log_of_words_is_not_a_trajectory(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    (tmp_path / "trajectory.log").rename(tmp_path / "z.log")
+    (tmp_path / "run.log").write_text("started\n")
+    (tmp_path / "config.json").write_text('{"name": 1}')
+    assert open_sequence(tmp_path).has_poses
+
+
+# Colour and masks of another size --------------------------------------------------------------
+
+
+def test_colour_and_mask_of_twice_the_size_are_scaled(tmp_path):
+    write_bundlesdf(tmp_path, SEEN)
+    half = np.zeros((2 * H, 2 * W), bool)
+    half[:, W:] = True
+    save(tmp_path / "masks/00000.png", half)
+    save(tmp_path / "rgb/00000.png", half[..., None].repeat(3, -1).astype(np.uint8) * 200)
+    frame = open_sequence(tmp_path)[0]
+    np.testing.assert_array_equal(frame.mask, half[::2, ::2])
+    assert frame.color.shape == (H, W, 3)
+    np.testing.assert_array_equal(frame.color[:, : W // 2 - 1], 0)
+    np.testing.assert_array_equal(frame.color[:, W // 2 + 1 :], 200)
+
+
+def test_colours_of_another_aspect_are_left_out_and_said(tmp_path):
+    seen = SEEN._replace(color=np.zeros((6, 72, 128, 3), np.uint8))
+    write_bundlesdf(tmp_path, seen)
+    sequence = open_sequence(tmp_path)
+    assert sequence[0].color is None
+    assert "128 x 72 pixels and depth images 64 x 48" in sequence.findings[0].evidence
+
+
+# Folders as people have them -------------------------------------------------------------------
+
+
+def test_odd_names_and_orders(tmp_path):
+    write_bundlesdf(tmp_path, SEEN)
+    for i, name in enumerate(["été 2", "9", "Kopie von 10", "left 1"]):
+        save(tmp_path / "depth" / f"{name}.PNG", raw(SEEN.depth[i], 1000))
+    for i in range(6):
+        (tmp_path / f"depth/{i:05d}.png").unlink()
+    (tmp_path / "depth/Thumbs.db").write_text("no image")
+    (tmp_path / "depth/.hidden.png").write_text("no image")
+    sequence = open_sequence(tmp_path)
+    assert set(sequence.names) == {"été 2", "9", "Kopie von 10", "left 1"}
+    colors = {frame.name: frame.color is not None for frame in sequence}
+    assert colors == {"été 2": True, "9": False, "Kopie von 10": False, "left 1": True}
+
+
+def test_frames_are_counted_not_spelt(tmp_path):
+    for i in (1, 2, 10, 100):
+        save(tmp_path / f"depth/{i}.png", raw(SEEN.depth[0], 1000))
+    assert open_sequence(tmp_path).names == ("1", "2", "10", "100")
+
+
+def test_a_folder_that_fits_nothing_says_what_would(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "notes.txt").write_text("")
+    said = fault_of(tmp_path)
+    assert "holds no recording but photos, notes.txt" in said
+    assert all(name in said for name in LAYOUTS)
+    (tmp_path / "empty").mkdir()
+    assert "holds no recording but nothing" in fault_of(tmp_path / "empty")
+    (tmp_path / "empty/depth").mkdir()
+    assert "holds no depth image" in fault_of(tmp_path / "empty")
+    assert "is not a folder" in fault_of(tmp_path / "nowhere")
+
+
+def test_a_folder_nearby_that_fits_is_named(tmp_path):
+    write_7_scenes(tmp_path / "scan/frames", SEEN)
+    assert f"give {tmp_path / 'scan/frames'}, which fits" in fault_of(tmp_path / "scan")
+    assert f"give {tmp_path / 'scan/frames'}, which fits" in fault_of(tmp_path)
+    write_bundlesdf(tmp_path / "other", SEEN)
+    assert f"give {tmp_path / 'other'}, which fits" in fault_of(tmp_path / "other/depth")
+
+
+def test_a_truncated_image_in_mid_sequence_costs_its_frame_alone(tmp_path):
+    write_tum(tmp_path, SEEN)
+    path = sorted((tmp_path / "depth").iterdir())[3]
+    for cut in (100, 0):
+        path.write_bytes(path.read_bytes()[:cut])
+        sequence = open_sequence(tmp_path)
+        for i in (0, 1, 2, 4, 5):
+            np.testing.assert_allclose(sequence[i].depth, SEEN.depth[i], rtol=1e-6)
+        with pytest.raises(SequenceError, match="cannot be read as an image"):
+            sequence[3]
+
+
+def test_a_first_image_that_is_damaged_does_not_hide_the_others(tmp_path):
+    write_redwood(tmp_path, SEEN)
+    for kind in ("depth", "rgb"):
+        sorted((tmp_path / kind).iterdir())[0].write_bytes(b"")
+    assert open_sequence(tmp_path)[1].depth.any()
+
+
+def test_ten_thousand_frames_open_at_once_and_unread(tmp_path, monkeypatch):
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "rgb").mkdir()
+    Image.fromarray(raw(SEEN.depth[0], 1000)).save(tmp_path / "one.png")
+    for i in range(10_000):
+        for kind in ("depth", "rgb"):
+            (tmp_path / f"{kind}/{i + 1:07d}-{i * 33333:012d}.png").hardlink_to(
+                tmp_path / "one.png"
+            )
+    decoded, load = [], ImageFile.ImageFile.load
+    monkeypatch.setattr(
+        ImageFile.ImageFile, "load", lambda image: (decoded.append(image), load(image))[1]
+    )
+    start = time.process_time()
+    sequence = open_sequence(tmp_path)
+    seconds = time.process_time() - start
+    assert len(sequence) == 10_000 and sequence.layout == "redwood" and not decoded
+    assert seconds < 3
+    assert sequence[9_876].color is not None and len(decoded) == 2
+
+
+@pytest.mark.parametrize(
+    "damage, said",
+    [
+        (lambda f: (f / "depth.txt").write_text("1.0\n"), "is not a list of images"),
+        (lambda f: (f / "depth.txt").write_text("# none\n"), "lists no image"),
+        (lambda f: (f / "depth.txt").write_text("1.0 gone.png\n"), "cannot be read as an image"),
+        (lambda f: (f / "groundtruth.txt").write_text("1 2 3\n"), "cannot be read as a traj"),
+        (lambda f: (f / "groundtruth.txt").write_text("1 0 0 0 0 0 0 2\n"), "quaternion of len"),
+        (lambda f: (f / "calibration.txt").write_text("500 500\n"), "cannot be read as a camera"),
+    ],
+)
+def test_damaged_lists(tmp_path, damage, said):
+    write_tum(tmp_path, SEEN)
+    damage(tmp_path)
+    assert said in fault_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "camera, said",
+    [
+        ('{"width": 64, "height": 64, "intrinsic_matrix": [1,0,0,0,1,0,32,24,1]}', "of 64 x 64"),
+        ('{"width": 64, "height": 48, "intrinsic_matrix": [1,0,0]}', "cannot be read as a camera"),
+        ('{"width": 64, "height": 48, "intrinsic_matrix": [0,0,0,0,1,0,32,24,1]}', "focal lengths"),
+        ("{", "cannot be read as a camera"),
+    ],
+)
+def test_damaged_cameras(tmp_path, camera, said):
+    write_open3d(tmp_path, SEEN)
+    (tmp_path / "camera_primesense.json").write_text(camera)
+    assert said in fault_of(tmp_path)
+
+
+def test_a_camera_that_is_guessed_is_a_finding_and_must_have_the_aspect(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    (tmp_path / "camera_primesense.json").unlink()
+    sequence = open_sequence(tmp_path)
+    assert "no camera file" in sequence.findings[0].evidence
+    np.testing.assert_allclose(sequence.intrinsics[0], [52.5, 0, 32])
+    for path in (tmp_path / "depth").iterdir():
+        save(path, np.full((36, 64), 2000, np.uint16))
+    assert "makes images of 640 x 480, not of 64 x 36" in fault_of(tmp_path)
