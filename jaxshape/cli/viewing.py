@@ -1,0 +1,43 @@
+"""`jaxshape view`: a result in the browser, also while it is being made."""
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from jaxshape.cli.common import require
+
+
+@dataclass(frozen=True)
+class View:
+    """Show a result folder in the browser: the shape, grids and cameras, to turn and to switch on
+    and off. While `jaxshape reconstruct` writes the folder, the picture follows.
+
+    Example: jaxshape view out/demo
+    """
+
+    result: Positional[Path]
+    """Folder made by `jaxshape reconstruct` or `jaxshape demo`, finished or not."""
+    port: int = 8080
+    """Where to serve; the next free one if it is taken."""
+    host: str = "127.0.0.1"
+    """Address to listen at; unless it is this one, others on the network see the result, too."""
+
+    def run(self) -> None:
+        require(
+            find_spec("viser") is not None,
+            "jaxshape view needs viser, which is not installed: pip install 'jaxshape[viewer]'. "
+            "report.html in the result folder shows the same without it.",
+        )
+        require(1 <= self.port <= 65535, f"--port is {self.port}; give 1 to 65535.")
+        require(
+            self.result.is_dir(),
+            f"There is no folder {str(self.result)!r}; give one made by jaxshape reconstruct.",
+        )
+        from jaxshape.results.viewer import view
+
+        def told(address: str) -> None:
+            print(f"{address} shows {self.result}; Ctrl-C ends", flush=True)
+
+        view(self.result, host=self.host, port=self.port, told=told)

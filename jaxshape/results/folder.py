@@ -1,0 +1,252 @@
+"""What a result folder holds, whatever of it is there, for the report and the viewer. [host]
+
+A folder may be old, half written, or rewritten at this moment: a file that is missing is left out,
+and of one that cannot be read, `problems` tells.
+"""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, UInt8
+
+from jaxshape.results.pictures import COLORS
+
+
+class Layer(NamedTuple):
+    """How one thing of the scene is called and drawn."""
+
+    label: str
+    color: str
+    shown: bool
+    """At first."""
+
+
+LAYERS = {
+    "mesh": Layer("mesh", COLORS["predicted"], True),
+    "occupied": Layer("measured (F)", COLORS["measured"], False),
+    "occluded": Layer("occluded (M)", COLORS["occluded"], False),
+    "encoder": Layer("prior (encoder)", "#CC79A7", False),
+    "refined": Layer("refined", "#D55E00", False),
+    "composed": Layer("composed", "#56B4E9", False),
+    "truth": Layer("truth", COLORS["truth"], False),
+    "cameras": Layer("keyframes", "#2B2F33", True),
+    "trajectory": Layer("trajectory", COLORS["measured"], True),
+}
+"""Everything that can be shown in 3D, in the palette of Okabe and Ito."""
+
+GRIDS = ("occupied", "occluded", "encoder", "refined", "composed", "truth")
+IMAGES = ("image", "depth", "mask")
+
+
+class Keyframe(NamedTuple):
+    """A fused frame; `None` for what is not known of it."""
+
+    name: str
+    T_world_camera: Float[np.ndarray, "4 4"] | None
+    files: dict[str, Path]
+    """Those of its image, depth and mask that are there."""
+    figures: dict[str, Any]
+    """All that keyframes.json says of it."""
+
+
+class ResultFolder(NamedTuple):
+    """The content of a result folder; what is missing is empty or `None`."""
+
+    name: str
+    result: dict[str, Any]
+    """The content of result.json."""
+    mesh: trimesh.Trimesh | None
+    """In the world frame, metres."""
+    grids: dict[str, Bool[np.ndarray, "x y z"]]
+    """Those of `GRIDS` that are there."""
+    origin: Float[np.ndarray, " 3"]
+    voxel_size: Float[np.ndarray, " 3"]
+    T_object_world: Float[np.ndarray, "4 4"]
+    intrinsics: tuple[float, float, float, float] | None
+    """fx, fy, cx, cy in pixels."""
+    shape: tuple[int, int] | None
+    """Height and width of the frames."""
+    keyframes: list[Keyframe]
+    frames: list[dict[str, Any]]
+    """Index, name, status and reason of every frame of the recording."""
+    trajectory: Float[np.ndarray, "s 2 3"]
+    """Segments of the camera's path in the object frame, metres."""
+    problems: list[str]
+    """A sentence for each file that cannot be read."""
+
+
+def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
+    """Read what is there of a folder made by `demo` or `reconstruct`, finished or not.
+
+    Without a grid the object frame is not known; the first keyframe's, turned upright, stands in.
+    `ValueError` where there is no such folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"There is no folder {str(folder)!r}; give one made by jaxshape.")
+    problems: list[str] = []
+
+    def read(name: str, reader: Callable[[Path], Any], missing: Any) -> Any:
+        if not (folder / name).is_file():
+            return missing
+        try:
+            return reader(folder / name)
+        except Exception as problem:  # of any library: one bad file must not hide the others
+            problems.append(f"{name} cannot be read: {problem}.")
+            return missing
+
+    keyframes, frames, intrinsics, shape = read("keyframes.json", _keyframes, ([], [], None, None))
+    grids, frame = read("grid.npz", _grids, ({}, None))
+    origin, voxel_size, T_world_object = frame or _stand_in(keyframes)
+    T_object_world = np.linalg.inv(T_world_object)
+    return ResultFolder(
+        name=folder.resolve().name,
+        result=read("result.json", _object, {}),
+        mesh=read("mesh.glb", _mesh, None),
+        grids=grids,
+        origin=origin,
+        voxel_size=voxel_size,
+        T_object_world=T_object_world,
+        intrinsics=intrinsics,
+        shape=shape,
+        keyframes=keyframes,
+        frames=frames,
+        trajectory=_segments(frames or [k.figures for k in keyframes], T_object_world),
+        problems=problems,
+    )
+
+
+def mesh_in_object(found: ResultFolder) -> trimesh.Trimesh | None:
+    """The mesh in the object frame, upright; `None` where there is none."""
+    return found.mesh and found.mesh.copy().apply_transform(found.T_object_world)
+
+
+def camera_poses(found: ResultFolder) -> list[tuple[Keyframe, Float[np.ndarray, "4 4"]]]:
+    """The keyframes whose pose is known, each with its `T_object_camera`."""
+    poses = ((k, k.T_world_camera) for k in found.keyframes)
+    return [(k, found.T_object_world @ pose) for k, pose in poses if pose is not None]
+
+
+def extent(found: ResultFolder) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre and radius of the object; of the camera's path where there is no object."""
+    mesh, path = mesh_in_object(found), found.trajectory.reshape(-1, 3)
+    if mesh is not None:
+        low, high = mesh.bounds
+    elif found.grids:
+        shape = next(iter(found.grids.values())).shape
+        low, high = found.origin, found.origin + shape * found.voxel_size
+    else:
+        low, high = (path.min(axis=0), path.max(axis=0)) if len(path) else (-np.ones(3), np.ones(3))
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+
+
+def half_field_of_view(found: ResultFolder) -> tuple[float, float]:
+    """Tangents of half the angle the camera sees across and down; a Kinect's where not known."""
+    if found.intrinsics is None or found.shape is None:
+        return 0.55, 0.41
+    (fx, fy, *_), (h, w) = found.intrinsics, found.shape
+    return w / (2 * fx), h / (2 * fy)
+
+
+def picture(keyframe: Keyframe, kind: str) -> UInt8[np.ndarray, "h w *c"] | Any | None:
+    """The pixels of a keyframe's image, depth or mask, as stored; `None` where unreadable."""
+    from PIL import Image
+
+    if kind not in keyframe.files:
+        return None
+    try:
+        with Image.open(keyframe.files[kind]) as image:
+            return np.asarray(image.convert("RGB") if kind == "image" else image)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+
+
+def thumbnail(image: Any, width: int) -> Any:
+    """Every n-th pixel of an image, about `width` across: quick, and right for depth, too."""
+    every = max(1, round(image.shape[1] / width))
+    return image[::every, ::every]
+
+
+# ------------------------------------------------------------------ one file each
+
+
+def _object(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise ValueError(f"a JSON object is expected, but it holds a {type(content).__name__}")
+    return content
+
+
+def _mesh(path: Path) -> trimesh.Trimesh:
+    mesh = trimesh.load_mesh(path)
+    if not np.isfinite(mesh.vertices).all() or len(mesh.faces) == 0:
+        raise ValueError("it has no faces, or vertices that are not finite")
+    return mesh
+
+
+def _grids(path: Path) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    with np.load(path, allow_pickle=False) as file:
+        grids = {name: file[name].astype(bool) for name in GRIDS if name in file}
+        frame = tuple(np.asarray(file[name], float) for name in ("origin", "voxel_size"))
+        T_world_object = pose_of(file["T_world_object"])
+    if any(grid.ndim != 3 for grid in grids.values()) or T_world_object is None:
+        raise ValueError("grids with three axes and a 4x4 T_world_object are expected")
+    return grids, (*frame, T_world_object)
+
+
+def _keyframes(path: Path) -> tuple[list[Keyframe], list[dict[str, Any]], Any, Any]:
+    content, folder = _object(path), path.parent.resolve()
+
+    def files(entry: dict[str, Any]) -> dict[str, Path]:
+        named = {kind: (folder / str(entry[kind])).resolve() for kind in IMAGES if entry.get(kind)}
+        # A result may come from someone else: it shows pictures of its own folder only.
+        return {k: p for k, p in named.items() if p.is_relative_to(folder) and p.is_file()}
+
+    keyframes = [
+        Keyframe(
+            str(entry.get("name", i)), pose_of(entry.get("T_world_camera")), files(entry), entry
+        )
+        for i, entry in enumerate(content.get("keyframes") or [])
+    ]
+    intrinsics, shape = content.get("intrinsics"), content.get("shape")
+    return (
+        keyframes,
+        [dict(frame) for frame in content.get("frames") or []],
+        tuple(float(x) for x in intrinsics) if intrinsics else None,
+        tuple(int(x) for x in shape) if shape else None,
+    )
+
+
+def pose_of(value: Any) -> Float[np.ndarray, "4 4"] | None:
+    """A 4x4 matrix of finite numbers, or `None`."""
+    try:
+        pose = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        return None
+    return pose if pose.shape == (4, 4) and np.isfinite(pose).all() else None
+
+
+def _stand_in(keyframes: list[Keyframe]) -> tuple[Any, ...]:
+    """A frame to look from before the object's is known: cameras see y pointing down."""
+    first = next((k.T_world_camera for k in keyframes if k.T_world_camera is not None), None)
+    upright = np.eye(4) if first is None else first @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return np.zeros(3), np.ones(3), upright
+
+
+def _segments(
+    frames: list[dict[str, Any]], T_object_world: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "s 2 3"]:
+    """From each posed frame to the next; the path is broken where frames between were lost."""
+    poses = [pose_of(frame.get("T_world_camera")) for frame in frames]
+    pairs = [
+        (a[:3, 3], b[:3, 3])
+        for a, b in zip(poses, poses[1:], strict=False)
+        if a is not None and b is not None
+    ]
+    segments = np.asarray(pairs, np.float64).reshape(-1, 2, 3)
+    return segments @ T_object_world[:3, :3].T + T_object_world[:3, 3]

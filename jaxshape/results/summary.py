@@ -1,0 +1,71 @@
+"""What a result comes to, in words and figures with units, for the report and the viewer. [host]"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from jaxshape.results.folder import Keyframe, ResultFolder
+
+
+class Figure(NamedTuple):
+    name: str
+    value: str
+    """With its unit."""
+    meaning: str
+
+
+def headline(found: ResultFolder) -> Iterator[Figure]:
+    """The figures that matter most, as far as they are known."""
+    result, counts = found.result, _counts(found)
+    if found.frames:
+        others = [f"{n} {status}" for status, n in counts.items() if status != "keyframe"]
+        value = f"{counts['keyframe']} of {len(found.frames)}"
+        yield Figure("Frames fused", value, ", ".join(others) or "all of the recording")
+    elif "frames" in result:
+        yield Figure("Frames fused", number(result["frames"]), "depth frames")
+    if "objective_refined" in result:
+        before, after = (number(result.get(f"objective_{n}"), 4) for n in ("encoder", "refined"))
+        meaning = (
+            "nats per observed voxel: cross-entropy with F outside M (Eq. 7), of the encoder’s "
+            "code, then of the refined one; lower is better"
+        )
+        yield Figure("Objective", f"{before} → {after}", meaning)
+    if "iou_composed" in result:
+        before, after = (number(result.get(f"iou_{n}"), 3) for n in ("encoder", "refined"))
+        meaning = (
+            f"of the composed shape (encoder {before}, refined {after}): surface voxels in both, "
+            "over those in either; 1 is perfect"
+        )
+        yield Figure("IoU with the truth", number(result["iou_composed"], 3), meaning)
+    if "seconds" in result:
+        yield Figure("Time", number(result["seconds"], 1, unit=" s"), "from start to result")
+
+
+def warnings_of(found: ResultFolder) -> list[str]:
+    """What the reconstruction warns of, frames that are not used, and files that are damaged."""
+    given, counts = found.result.get("warnings") or [], _counts(found)
+    unused = [
+        f"{counts[status]} of {len(found.frames)} frames were {status}, and are not fused."
+        for status in ("lost", "unreadable")
+        if counts[status]
+    ]
+    return [*([given] if isinstance(given, str) else map(str, given)), *unused, *found.problems]
+
+
+def tracked(keyframe: Keyframe) -> str:
+    """How well a keyframe's pose is known."""
+    inliers, rmse = keyframe.figures.get("inlier_fraction"), keyframe.figures.get("rmse")
+    agree = number(inliers, 0, times=100.0, unit=" % inliers")
+    return ", ".join(filter(None, (agree, number(rmse, 1, times=1000.0, unit=" mm"))))
+
+
+def number(value: Any, digits: int = 0, *, times: float = 1.0, unit: str = "") -> str:
+    """A number for people; nothing for what is none, a dash for what is not finite."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return ""
+    return f"{times * value:.{digits}f}{unit}" if math.isfinite(value) else "–"
+
+
+def _counts(found: ResultFolder) -> Counter[str]:
+    return Counter(str(frame.get("status")) for frame in found.frames)

@@ -1,0 +1,175 @@
+"""The live view: what it serves, and that it follows the folder."""
+
+import io
+import json
+import shutil
+import time
+import urllib.request
+
+import numpy as np
+import pytest
+from browser import opened_browser
+from PIL import Image
+from result_folder import KEYFRAMES, change_json, write_folder, write_json
+
+from jaxshape.cli import common, viewing
+
+pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
+from jaxshape.results import viewer
+from jaxshape.results.viewer import LiveView, view
+
+GRIDS = {"/occupied", "/occluded", "/encoder", "/refined", "/composed", "/truth"}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "result"
+    write_folder(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "result")
+
+
+@pytest.fixture
+def open_view():
+    """Serve folders at free ports of this machine alone."""
+    opened = []
+
+    def serve(folder):
+        opened.append(LiveView(folder, host="127.0.0.1", port=0))
+        return opened[-1]
+
+    yield serve
+    for live in opened:
+        live.stop()
+
+
+def nodes(live):
+    return set(live._drawn)
+
+
+def test_it_answers_at_the_address_it_tells(folder, open_view):
+    live = open_view(folder)
+    assert live.url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(live.url, timeout=10) as answer:
+        assert answer.status == 200 and b"<html" in answer.read()
+
+
+def test_the_scene_holds_shape_grids_and_cameras(folder, open_view):
+    live = open_view(folder)
+    cameras = {f"/cameras/{i}" for i in range(KEYFRAMES)}
+    assert nodes(live) == {"/mesh", "/trajectory"} | GRIDS | cameras
+    assert "a chair" in live.figures.content and "0.5000 → 0.2500" in live.figures.content
+    assert live.boxes["mesh"].value and not live.boxes["occupied"].value
+    _, mesh = live._drawn["/mesh"]
+    _, occupied = live._drawn["/occupied"]
+    assert mesh.visible and not occupied.visible
+    live.boxes["occupied"].value = True
+    live._show()
+    assert occupied.visible
+
+
+def test_cubes_lie_on_the_voxels(folder, open_view):
+    _, truth = open_view(folder)._drawn["/truth"]
+    low, high = truth.batched_positions.min(axis=0), truth.batched_positions.max(axis=0)
+    origin, size = np.array([-0.32, -0.48, -0.32]), np.array([0.02, 0.03, 0.02])
+    np.testing.assert_allclose(low, origin + (np.array([4, 1, 4]) + 0.5) * size, atol=1e-6)
+    np.testing.assert_allclose(high, origin + (np.array([27, 30, 27]) + 0.5) * size, atol=1e-6)
+
+
+def test_it_follows_the_folder_and_redraws_only_what_changed(folder, open_view):
+    live = open_view(folder)
+    assert not live.refresh()
+    before = dict(live._drawn)
+    content = json.loads((folder / "keyframes.json").read_text())
+    content["keyframes"] = content["keyframes"][:1]
+    write_json(folder / "keyframes.json", content)
+    change_json(folder / "result.json", running=True)
+    assert live.refresh() and not live.refresh()
+    assert nodes(live) == {"/mesh", "/trajectory", "/cameras/0"} | GRIDS
+    assert all(live._drawn[name] is before[name] for name in nodes(live) & GRIDS)
+    assert "still running" in live.figures.content
+
+
+def test_a_folder_that_fills_is_shown_as_it_does(made, tmp_path, open_view):
+    folder = tmp_path / "result"
+    folder.mkdir()
+    live = open_view(folder)
+    assert not nodes(live)
+    shutil.copytree(made / "keyframes", folder / "keyframes")
+    (folder / "mesh.glb").write_bytes(b"half")
+    shutil.copy(made / "keyframes.json", folder)
+    assert live.refresh() and len(nodes(live)) == KEYFRAMES + 1
+    assert "mesh.glb cannot be read" in live.figures.content
+    assert live.slider.value == KEYFRAMES - 1  # the newest
+    for name in ("mesh.glb", "grid.npz", "result.json"):
+        shutil.copy(made / name, folder)
+    assert live.refresh() and {"/mesh"} | GRIDS <= nodes(live)
+    assert "cannot be read" not in live.figures.content
+
+
+def test_the_last_picture_stays_when_the_folder_goes(folder, open_view):
+    live = open_view(folder)
+    before = nodes(live)
+    shutil.rmtree(folder)
+    assert not live.refresh() and nodes(live) == before
+
+
+def test_text_from_the_folder_stays_text(folder, open_view):
+    change_json(folder / "result.json", object="<b>x</b>", warnings=["<i>y</i>"])
+    shown = open_view(folder).figures.content
+    assert "&lt;b&gt;x" in shown and "&lt;i&gt;y" in shown
+
+
+def test_an_address_of_another_machine_is_refused(folder):
+    with pytest.raises(ValueError, match="address of this machine"):
+        LiveView(folder, host="192.0.2.1", port=0)
+
+
+def test_an_interrupt_ends_it(folder, monkeypatch):
+    told = []
+
+    def interrupt(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewer.time, "sleep", interrupt)
+    view(folder, host="127.0.0.1", port=0, told=told.append)
+    monkeypatch.undo()
+    time.sleep(0.2)
+    with pytest.raises(OSError):
+        urllib.request.urlopen(told[0], timeout=2)
+
+
+def test_a_browser_shows_the_scene(folder, open_view):
+    live = open_view(folder)
+    with opened_browser() as browser:
+        tab = browser.new_page(viewport={"width": 900, "height": 600})
+        tab.goto(live.url)
+        tab.get_by_text("a chair").wait_for()
+        orange = lambda: (  # noqa: E731
+            np.abs(
+                np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), int)
+                - (0xE6, 0x9F, 0)
+            ).sum(axis=-1)
+            < 150
+        ).mean()
+        end = time.monotonic() + 20
+        while orange() < 0.01 and time.monotonic() < end:
+            tab.wait_for_timeout(300)
+        assert orange() > 0.01
+
+
+# --- the command ------------------------------------------------------------------------------
+
+
+def test_what_is_missing_is_told_in_a_sentence(folder, tmp_path, monkeypatch):
+    with pytest.raises(common.BadInput, match="no folder"):
+        viewing.View(tmp_path / "none").run()
+    with pytest.raises(common.BadInput, match="--port"):
+        viewing.View(folder, port=0).run()
+    monkeypatch.setattr(viewing, "find_spec", lambda name: None)
+    with pytest.raises(common.BadInput, match=r"pip install 'jaxshape\[viewer\]'"):
+        viewing.View(folder).run()
