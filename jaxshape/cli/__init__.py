@@ -5,9 +5,12 @@ its `run` does the work. Bad input ends with one sentence on standard error and 
 leaves earlier output as it was. JAX, and all that needs it, is imported inside `run`, so that
 `--help` answers at once.
 
-    rebuild    demo, reconstruct
+    rebuild    demo
+    recording  reconstruct
+    inspecting inspect
     learning   dataset, train
     scoring    evaluate, plot
+    viewing    view
 """
 
 import sys
@@ -19,9 +22,12 @@ from rich.markup import escape
 from tyro.conf import subcommand
 
 from jaxshape.cli.common import console
+from jaxshape.cli.inspecting import Inspect
 from jaxshape.cli.learning import Dataset, Train, preset_in
-from jaxshape.cli.rebuild import Demo, Reconstruct
+from jaxshape.cli.rebuild import Demo
+from jaxshape.cli.recording import Reconstruct
 from jaxshape.cli.scoring import Evaluate, Plot
+from jaxshape.cli.viewing import View
 from jaxshape.process import prepare_process
 
 
@@ -32,8 +38,10 @@ def commands(train: Train) -> Any:
         | Annotated[Dataset, subcommand("dataset")]
         | Annotated[Train, subcommand("train", default=train)]
         | Annotated[Reconstruct, subcommand("reconstruct")]
+        | Annotated[Inspect, subcommand("inspect")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]
+        | Annotated[View, subcommand("view")]
     )
 
 

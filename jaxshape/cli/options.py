@@ -7,6 +7,7 @@ from typing import Any
 from jaxshape import process
 from jaxshape.cli.common import require
 from jaxshape.data.config import Axis, DatasetConfig
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.model.config import TrainConfig
 from jaxshape.refine.config import RefineConfig
 
@@ -65,6 +66,30 @@ def checked_search(search: RefineConfig) -> RefineConfig:
         ("target", search.target is None or not math.isnan(search.target), "a number"),
     )
     return search
+
+
+def checked_mapping(config: MappingConfig) -> MappingConfig:
+    """The options of a map, once each is in its range."""
+    _require_each(
+        config,
+        ("keyframe_angle", _positive(config.keyframe_angle), "a number of degrees above 0"),
+        ("keyframe_distance", _positive(config.keyframe_distance), "a number of metres above 0"),
+        ("min_hits", config.min_hits >= 1, "1 or more"),
+        ("keyframe_iterations", config.keyframe_iterations >= 1, "1 or more"),
+    )
+    return config
+
+
+def checked_tracking(config: TrackingConfig) -> TrackingConfig:
+    """The options of tracking, once each is in its range."""
+    _require_each(
+        config,
+        ("min_inliers", 0 <= config.min_inliers <= 1, "a share from 0 to 1"),
+        ("min_overlap", 0 <= config.min_overlap <= 1, "a share from 0 to 1"),
+        ("max_angle", _positive(config.max_angle), "a number of degrees above 0"),
+        ("max_distance", _positive(config.max_distance), "a number of metres above 0"),
+    )
+    return config
 
 
 def checked_dataset(config: DatasetConfig) -> DatasetConfig:

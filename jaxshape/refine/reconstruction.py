@@ -84,16 +84,23 @@ def reconstruct(
     occluded: Bool[Array, "object x y z"],
     refiner: Refiner | None,
     config: RefineConfig,
+    earlier: Float[Array, "object d"] | None = None,
 ) -> Reconstruction:
     """Rebuild a batch of objects from their measurement grids F and occlusion masks M.
 
-    `keys` holds one random key per object.
+    `keys` holds one random key per object. `earlier` are codes found when less was measured: the
+    search starts from them where they explain the grids better than what the encoder proposes.
     """
     first_code = encode(prior.params, occupied)
     first_logits = decode(prior.params, first_code)
     weight = BALANCED_WEIGHT if config.objective == "balanced" else 1.0
     targets = target(occupied, occluded, first_logits, occupied_weight=weight)
     first_objective = cross_entropy(first_logits, targets)
+    start, start_objective = first_code, first_objective
+    if earlier is not None:
+        again = cross_entropy(decode(prior.params, earlier), targets)
+        start = jnp.where((again < first_objective)[:, None], earlier, first_code)
+        start_objective = jnp.minimum(again, first_objective)
     if refiner is None:
         code, logits, objective, found = first_code, first_logits, first_objective, None
     else:
@@ -102,13 +109,13 @@ def reconstruct(
         found = refine(
             keys,
             prior.params,
-            first_code,
+            start,
             targets,
             refiner,
             config.iterations,
             space=search_space(prior, config),
             penalty=unlikeliness(prior, config.prior_weight),
-            first_losses=first_objective if is_first_loss else None,
+            first_losses=start_objective if is_first_loss else None,
             target_loss=config.target,
             precision=config.precision,
         )

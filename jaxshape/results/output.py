@@ -43,16 +43,31 @@ def write_result(
     reconstruction: Reconstruction,
     figures: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write `mesh.glb`, `grid.npz`, `trace.npz`, `overview.png` and, last, `result.json` of ONE
-    object.
+    """Write `overview.png` and the files of `write_shape`, then `result.json`, of ONE object.
+
+    `result.json` holds `figures`, the objective before and after, what the search took and why it
+    stopped, and the IoUs where the truth is known; it is returned.
+    """
+    folder = Path(folder)
+    result = write_shape(folder, observation, reconstruction, figures)
+    draw(folder, observation, reconstruction, result)
+    with atomic_path(folder / "result.json") as path:
+        path.write_text(json.dumps(result, indent=2))
+    return result
+
+
+def write_shape(
+    folder: Path,
+    observation: Observation,
+    reconstruction: Reconstruction,
+    figures: dict[str, Any],
+) -> dict[str, Any]:
+    """Write `mesh.glb`, `mesh.ply`, `grid.npz` and `trace.npz` of ONE object; returns its figures.
 
     The mesh is the composed shape in the world frame, in metres. The trace has a row for each
-    iteration of the search; there is none of the encoder alone. `result.json` holds `figures`, the
-    objective before and after, what the search took and why it stopped, and the IoUs where the
-    truth is known; it is returned.
+    iteration of the search; there is none of the encoder alone.
     """
-    folder, one = Path(folder), jax.device_get(jax.tree.map(lambda x: x[0], reconstruction))
-    result = {**figures, **_searched(one), **_measured(observation, one)}
+    one = _only(reconstruction)
     mesh = surface(
         one.composed,
         observation.frame,
@@ -60,15 +75,24 @@ def write_result(
         T_world_object=observation.T_world_object,
     )
     write_mesh(mesh, folder / "mesh.glb")
+    write_mesh(mesh, folder / "mesh.ply")
     _write_grids(folder / "grid.npz", observation, one)
     if one.trace is None:
         (folder / "trace.npz").unlink(missing_ok=True)  # of an earlier search
     else:
         write_trace(folder / "trace.npz", jax.tree.map(lambda x: x[: one.iterations], one.trace))
-    _draw(folder / "overview.png", observation, one, result)
-    with atomic_path(folder / "result.json") as path:
-        path.write_text(json.dumps(result, indent=2))
-    return result
+    return {**figures, **_searched(one), **_measured(observation, one)}
+
+
+def draw(
+    folder: Path, observation: Observation, reconstruction: Reconstruction, result: dict[str, Any]
+) -> None:
+    """Write `overview.png`."""
+    _draw(folder / "overview.png", observation, _only(reconstruction), result)
+
+
+def _only(reconstruction: Reconstruction) -> Any:
+    return jax.device_get(jax.tree.map(lambda x: x[0], reconstruction))
 
 
 def _searched(one: Any) -> dict[str, Any]:

@@ -1,0 +1,193 @@
+"""`jaxshape reconstruct`: one object from a recording."""
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+from tyro.conf import Positional
+
+from jaxshape.cli.common import console, progress_bar, require
+from jaxshape.cli.options import checked_mapping, checked_tracking
+from jaxshape.cli.rebuild import Rebuild, report_objective
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct(Rebuild):
+    """Rebuild an object from an RGB-D recording: find it, track the camera, map it.
+
+    The object is found by itself where it is alone and central, or by a click, a region, a depth
+    range, masks beside the images, or its box. Poses are used where they are given. A run that was
+    killed goes on when the same command is given again; `jaxshape view` shows it while it runs.
+
+    Examples: jaxshape reconstruct scan/
+
+    jaxshape reconstruct scan/ --click 320 240 --poses none
+
+    jaxshape reconstruct scan/ --box box.json --every 5
+    """
+
+    frames: Positional[Path]
+    """Folder of a recording; `jaxshape inspect` says what it holds."""
+    click: tuple[float, float] | None = None
+    """Column and row of a pixel of the first frame that shows the object."""
+    region: tuple[float, float, float, float] | None = None
+    """Left, top, right and bottom of a part of the first frame that holds the object alone."""
+    depth_range: tuple[float, float] | None = None
+    """Nearest and farthest depth of the object in the first frame, in metres."""
+    box: Path | None = None
+    """JSON file with the object's box: {"T_world_object": 4x4, "size": [x, y, z]}. The object
+    frame has +y up and its front along +z; the world is that of the poses or, without, of the
+    first camera."""
+    poses: Literal["auto", "given", "first", "none"] = "auto"
+    """Which given poses to use: all (auto: where there are any), the first alone, or none."""
+    first: int = 0
+    """Number of the first frame, from 0."""
+    every: int = 1
+    """Use every n-th frame."""
+    depth_scale: float | None = None
+    """Depth units in a metre, where they are not those of the layout."""
+    tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
+    mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
+    fresh: bool = False
+    """Begin anew even if an unfinished run lies in the output folder."""
+    output: Path = Path("out/reconstruct")
+    """Folder for mesh.glb, mesh.ply, grid.npz, trajectory.txt, keyframes.json, result.json,
+    report.html and more."""
+
+    def run(self) -> None:
+        start = time.perf_counter()
+
+        from jaxshape.data.boxes import read_box
+        from jaxshape.data.sequences import open_sequence
+        from jaxshape.mapping.incremental import build_mapper
+        from jaxshape.mapping.recording import find_start, follow
+        from jaxshape.mapping.segmentation import Prompt, check_prompt
+        from jaxshape.results.progress import load_state, remove_state, save_state, write_progress
+
+        require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
+        require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")
+        mapping, tracking = checked_mapping(self.mapping), checked_tracking(self.tracking)
+        prior, refiner, search = self.prepare()
+        sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
+        require(
+            self.first < len(sequence),
+            f"--first is {self.first}, but there are {len(sequence)} frames, counted from 0.",
+        )
+        prompt = Prompt(self.click, self.region, self.depth_range)
+        check_prompt(prompt, sequence.shape)
+        box = read_box(self.box) if self.box else None
+        use_poses = self._use_poses(sequence)
+        mapper = build_mapper(prior, refiner, search, mapping, tracking, seed=self.seed)
+        figures: dict[str, Any] = {"object": str(self.frames), **self.settings()}
+        figures |= {"mapping": asdict(mapping), "tracking": asdict(tracking)}
+        settings = figures | {
+            "box": None if box is None else [x.tolist() for x in box],
+            "prompt": asdict(prompt),
+            "poses": self.poses,
+            "frames": [self.first, self.every, len(sequence)],
+            "depth_scale": sequence.depth_scale,
+        }
+        earlier = None
+        if not self.fresh:
+            earlier = load_state(
+                self.output, sequence, prior, settings, isotropic=mapping.isotropic
+            )
+        if earlier is None:
+            with console.status("finding the object"):
+                found = find_start(
+                    sequence,
+                    prior,
+                    prompt,
+                    box=box,
+                    first=self.first,
+                    use_pose=self.poses != "none",
+                )
+        else:
+            found = earlier.start
+            console.print(f"going on after frame {earlier.logs[-1].name}")
+        for note in found.notes:
+            console.print(note, highlight=False)
+        chosen = range(found.index, len(sequence), self.every)
+        progress, written = earlier, time.perf_counter()
+        with progress_bar("frames") as bar:
+            task = bar.add_task("follow", total=len(chosen), note="")
+            for progress in follow(
+                sequence,
+                found,
+                mapper,
+                prior,
+                chosen=chosen,
+                use_poses=use_poses,
+                earlier=earlier,
+            ):
+                bar.update(task, completed=len(progress.logs), note=_note(progress))
+                if progress.logs[-1].status != "keyframe":
+                    continue
+                save_state(self.output, progress, settings)
+                if time.perf_counter() - written > _SECONDS_BETWEEN_WRITES:
+                    seconds = {"seconds": round(time.perf_counter() - start, 2)}
+                    write_progress(
+                        self.output, sequence, progress, figures | seconds, mapping.min_hits,
+                        running=True,
+                    )  # fmt: skip
+                    written = time.perf_counter()
+        assert progress is not None  # there is at least the first frame
+        with console.status("searching the space of shapes"):
+            state, shape = mapper.finish(progress.state)
+        progress = progress._replace(state=state, shape=shape)
+        figures["seconds"] = round(time.perf_counter() - start, 2)
+        result = write_progress(
+            self.output, sequence, progress, figures, mapping.min_hits, running=False
+        )
+        self._conclude(progress, result)
+        remove_state(self.output)
+
+    def _use_poses(self, sequence: Any) -> bool:
+        """Whether all given poses are used; refuses what cannot be."""
+        from jaxshape.data.sequences import poses_look_inverted
+
+        if self.poses in ("given", "first"):
+            require(
+                sequence.has_poses,
+                f"--poses is {self.poses}, but {str(self.frames)!r} has none; leave it out.",
+            )
+        if self.poses in ("none", "first") or not sequence.has_poses:
+            return False
+        require(
+            not poses_look_inverted(sequence),
+            f"The poses in {str(self.frames)!r} look like world to camera: the frames agree better "
+            "when each is inverted. Write camera to world, or add --poses none to track instead.",
+        )
+        return True
+
+    def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
+        """Draw what was found and say it."""
+        from jaxshape.refine.reconstruction import require_measured
+        from jaxshape.results.output import draw
+        from jaxshape.results.progress import observation_of
+        from jaxshape.results.report import write_report
+
+        observation = observation_of(progress.state, self.mapping.min_hits)
+        require_measured(observation.occupied)
+        with console.status("drawing"):
+            draw(self.output, observation, progress.shape, result)
+            write_report(self.output)
+        lost = result["frames_lost"] + result["frames_unreadable"]
+        print(
+            f"{result['frames']} frames, {result['keyframes']} of them keyframes, {lost} left out"
+        )
+        for log in progress.logs:
+            if log.status in ("lost", "unreadable"):
+                console.print(f"{log.name}: {log.status}, {log.reason}", highlight=False)
+        report_objective(result)
+        print(f"wrote mesh.glb, trajectory.txt, result.json, report.html and more to {self.output}")
+
+
+_SECONDS_BETWEEN_WRITES = 3.0
+
+
+def _note(progress: Any) -> str:
+    return f"{len(progress.state.keyframes)} keyframes"

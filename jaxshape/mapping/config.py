@@ -1,0 +1,42 @@
+"""Settings of tracking and mapping; free of JAX, so that the command line can show them at once."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """How the pose of a frame is found, and when it is believed."""
+
+    against: Literal["map", "keyframe"] = "map"
+    """Align with the last keyframe and the surface of the map, or with the keyframe alone."""
+    on: Literal["scene", "object"] = "scene"
+    """Align all pixels, where the camera moves through a still room; or those of the object, where
+    it turns before a still camera."""
+    min_inliers: float = 0.6
+    """Share of the points, of those that should be seen again, that must agree."""
+    min_overlap: float = 0.25
+    """Share of the points that must be seen again."""
+    max_angle: float = 35.0
+    """Degrees from the expected pose beyond which a pose is not believed."""
+    max_distance: float = 0.5
+    """Metres from the expected pose beyond which a pose is not believed."""
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """When a frame becomes a keyframe, and what the map makes of it."""
+
+    keyframe_angle: float = 10.0
+    """Degrees between neighbouring keyframes, as seen from the object."""
+    keyframe_distance: float = 0.15
+    """Metres between neighbouring keyframes."""
+    realign: bool = True
+    """Realign all keyframes with the refined shape after each new one."""
+    isotropic: bool = False
+    """Scale all axes of the grid alike, as the paper does on real data, instead of filling the
+    box."""
+    min_hits: int = 1
+    """Depth points that make a voxel occupied; more than 1 suppresses stray points."""
+    keyframe_iterations: int = 40
+    """Steps of the search after each keyframe, from the code found so far."""
