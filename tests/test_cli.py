@@ -30,7 +30,7 @@ from jaxshape.results import evaluation
 from jaxshape.results.plots import plot_search
 from jaxshape.results.traces import read_search
 
-COMMANDS = ("demo", "dataset", "train", "reconstruct", "evaluate", "plot")
+COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
 
 
 @pytest.fixture

@@ -219,7 +219,7 @@ def robust_weight(
 def _solve(system: _System) -> tuple[jaxlie.SE3, Float[Array, ""]]:
     """The motion that the equations ask for, and its length; motions they leave free are zero."""
     eigenvalues, axes = jnp.linalg.eigh(system.hessian)
-    floor = _DAMPING * jnp.maximum(eigenvalues[-1], 1e-30)
+    floor = _DAMPING * jnp.maximum(eigenvalues[-1], 1e-6)  # its square is not 0 without matches
     inverse = eigenvalues / (eigenvalues**2 + floor**2)
     motion = -axes @ (inverse * (axes.T @ system.gradient))
     rotation = jaxlie.SO3.exp(motion[3:] / system.radius)

@@ -55,6 +55,10 @@ class Shot(NamedTuple):
     """Pixels that may show the object: a given mask, or all."""
 
 
+# Pixels that may show the object, from its box and the pose of the camera, both in the world.
+Cut = Callable[[Box, jaxlie.SE3], Bool[Array, "h w"]]
+
+
 class Keyframe(NamedTuple):
     """What the map keeps of a frame."""
 
@@ -118,7 +122,7 @@ class Step(NamedTuple):
     shape: Reconstruction | None
     """As refined after a keyframe, a batch of one."""
     seconds: dict[str, float]
-    """What the parts took: track, fuse, refine, realign."""
+    """What the parts took: track, cut, fuse, refine, realign."""
 
 
 class Mapper(NamedTuple):
@@ -162,8 +166,13 @@ def build_mapper(
         clock.lap("refine", state)
         return state, Step("keyframe", "", T_world_camera, None, shape, clock.seconds)
 
-    def step(state: State, shot: Shot, T_given: jaxlie.SE3 | None = None) -> tuple[State, Step]:
-        """Track a frame, unless its pose is given, and map it if it has moved enough."""
+    def step(
+        state: State, shot: Shot, T_given: jaxlie.SE3 | None = None, cut: Cut | None = None
+    ) -> tuple[State, Step]:
+        """Track a frame, unless its pose is given, and map it if it has moved enough.
+
+        `cut` tells which pixels of a new keyframe may show the object, once its pose is known.
+        """
         clock = _Clock()
         if T_given is None:
             alignment, reason = tracked(state, shot)
@@ -178,6 +187,9 @@ def build_mapper(
         moved_on = state._replace(T_world_camera=T, T_before_last=motion)
         if not has_moved(state, T):
             return moved_on, Step("tracked", "", T, alignment, None, clock.seconds)
+        if cut is not None:
+            shot = shot._replace(masked=shot.masked & cut(state.place.cut, T))
+            clock.lap("cut", shot)
         new = keyframe_of(shot, state.place, T, _odometry(state, T, alignment))
         state = moved_on._replace(keyframes=(*state.keyframes, new), view=shot.view)
         state = _added(state, new)

@@ -19,14 +19,15 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxshape.data.boxes import Box
+from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.data.sequences import Frame, Sequence, SequenceError
+from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.mapping import placement
-from jaxshape.mapping.incremental import Mapper, Shot, State, Step
+from jaxshape.mapping.incremental import Keyframe, Mapper, Shot, State, Step
 from jaxshape.mapping.placement import Placement
 from jaxshape.mapping.planes import Floor, camera_points, dominant_planes, floor_plane
-from jaxshape.mapping.segmentation import Prompt, Segmentation, segment
+from jaxshape.mapping.segmentation import Prompt, Segmentation, segment, segment_inside
 from jaxshape.mapping.sight import pooled, sight
 from jaxshape.mapping.views import halved, view_of
 from jaxshape.model.weights import ShapePrior
@@ -37,6 +38,9 @@ WORKING_WIDTH = 400
 
 SURE = 0.5
 """Confidence of a segmentation from which a frame may be the first."""
+
+SURE_OF_PROMPT = 0.1
+"""The same where the user said what to look at."""
 
 FIRST_FRAMES = 10
 """Frames among which the first that shows the object well is looked for."""
@@ -124,7 +128,7 @@ def find_start(
             reasons.append(f"{sequence.names[index]}: {problem}")
             continue
         found = segment(frame.depth, frame.color, sequence.intrinsics, prompt, frame.mask)
-        if found.confidence >= SURE or (_is_prompted(prompt) and found.segmented.any()):
+        if found.confidence >= (SURE_OF_PROMPT if _is_prompted(prompt) else SURE):
             return _place_first(sequence, prior, index, frame, found, use_pose)
         reasons.append(f"{frame.name}: {found.reason}")
         if _is_prompted(prompt):
@@ -365,7 +369,10 @@ def _next(
         return progress._replace(logs=(*logs, log))
     given = frame.T_world_camera if use_poses else None
     shot = prepare(frame, sequence.intrinsics)
-    state, step = mapper.step(state, shot, None if given is None else as_pose(given))
+    # A mask, or a box that was given, says what is the object; one that was found is not sure.
+    is_estimated = progress.start.T_level_world is not None and frame.mask is None
+    cut = partial(_cut, frame, sequence, state.keyframes) if is_estimated else None
+    state, step = mapper.step(state, shot, None if given is None else as_pose(given), cut)
     relative = None
     if step.T_world_camera is not None:
         keyframe = state.keyframes[-1].T_world_camera
@@ -380,6 +387,31 @@ def _next(
         figures=_figures(step),
     )
     return Progress(state, progress.start, (*logs, log), step.shape or progress.shape)
+
+
+def _cut(
+    frame: Frame, sequence: Sequence, keyframes: tuple[Keyframe, ...], box: Box, T: jaxlie.SE3
+) -> Bool[Array, "_ _"]:
+    """The clusters of a frame that lie mostly in the object's box and are nothing seen before."""
+    others = np.concatenate([_others(one, box) for one in keyframes[:1] + keyframes[1:][-8:]])
+    T_world_camera = np.asarray(T.as_matrix(), np.float64)
+    found = segment_inside(frame.depth, sequence.intrinsics, box, T_world_camera, others)
+    return _resized(found, keyframes[0].depth.shape)
+
+
+def _others(keyframe: Keyframe, box: Box) -> Float[np.ndarray, "n 3"]:
+    """World points in the object's box that a keyframe took for something else."""
+    points = np.asarray(_world_points(keyframe), np.float64)[::3, ::3]
+    other = (~np.asarray(keyframe.masked) & (np.asarray(keyframe.depth) > 0))[::3, ::3]
+    points = points[other]
+    return points[points_in_box(points, box)]
+
+
+@jax.jit
+def _world_points(keyframe: Keyframe) -> Float[Array, "h w 3"]:
+    known = jnp.where(jnp.isfinite(keyframe.depth), keyframe.depth, 0)
+    points = camera.unproject(keyframe.intrinsics, known)
+    return camera.transform(keyframe.T_world_camera, points)
 
 
 def _figures(step: Step) -> dict[str, float]:

@@ -9,17 +9,14 @@ footprint; and its feet, which depth cannot tell from the floor, are found by th
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import mean
 from scipy.spatial import KDTree
 from skimage.color import rgb2lab
 from skimage.measure import label
 
-from jaxshape.geometry import camera
-from jaxshape.geometry.camera import Intrinsics
+from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.mapping.clusters import (
     Pixel,
     View,
@@ -39,6 +36,18 @@ from jaxshape.mapping.planes import Plane, floor_plane, height_above, subsample,
 SEPARABLE = 0.95
 """Colours tell the object from the floor if they put this share of known pixels where they are."""
 
+
+CLICK_RADIUS = 4.0
+"""Pixels of the reduced image around a click that may be meant."""
+
+MOSTLY = 0.5
+"""Share of a cluster that must lie in the object's box to be part of it."""
+
+NEAR = 0.03
+"""Metres within which two frames have measured the same thing."""
+
+NOTHING = np.zeros((0, 3))
+"""No points."""
 
 CANDIDATES = 5
 """Clusters that are joined with what belongs to them before one is chosen."""
@@ -108,23 +117,31 @@ def segment(
     return Segmentation(enlarged(segmented, view, depth) & allowed, *_judged(doubts, len(chosen)))
 
 
-def segment_in_box(
-    depth: Float[Array, "h w"],
-    intrinsics: Intrinsics,
-    T_object_camera: jaxlie.SE3,
-    half_size: Float[Array, " 3"],
-    floor: Float[Array, ""] | float = -jnp.inf,
-) -> Bool[Array, "h w"]:
-    """The pixels of a frame that measure points in the object's box and above the floor.
+def segment_inside(
+    depth: Float[np.ndarray, "h w"],
+    K: Float[np.ndarray, "3 3"],
+    box: Box,
+    T_world_camera: Float[np.ndarray, "4 4"],
+    others: Float[np.ndarray, "n 3"] = NOTHING,
+) -> Bool[np.ndarray, "h w"]:
+    """The pixels of a later frame that show the object, of which a box is known.
 
-    The box is centred in the object frame; `half_size` and `floor`, the height y at which the
-    object stands, are in metres. Depth is 0 or infinite where nothing was measured.
+    Those of the clusters that lie mostly in the box, and mostly not where earlier frames saw other
+    things, at the points `others`: a table that reaches into the box is left out, and what the
+    object has outside of it is not lost. Box and points are in the world, in metres.
     """
-    measured = (depth > 0) & jnp.isfinite(depth)
-    points = camera.unproject(intrinsics, jnp.where(measured, depth, jnp.nan))
-    points = camera.transform(T_object_camera, points)
-    inside = jnp.all(jnp.abs(points) <= half_size, axis=-1)  # False for NaN
-    return inside & (points[..., 1] > floor + tolerance(depth))
+    view = look(depth, K)
+    known = np.isfinite(view.z)
+    points = view.points[known] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    ours = points_in_box(points, box)
+    if len(others):
+        ours &= np.isinf(KDTree(others).query(points, distance_upper_bound=NEAR)[0])
+    inside = np.zeros(known.shape, bool)
+    inside[known] = ours
+    labels = clusters(view, known & ~background(view, None))
+    shares = np.asarray(mean(inside, labels, np.arange(labels.max() + 1)))
+    chosen = np.flatnonzero(shares > MOSTLY)
+    return enlarged(np.isin(labels, chosen[chosen > 0]), view, depth)
 
 
 def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:
@@ -188,10 +205,22 @@ def _target(prompt: Prompt, view: View) -> Pixel:
 
 
 def _nearest(labels: Int[np.ndarray, "h w"], view: View, target: Pixel) -> tuple[list[int], Doubt]:
-    """The cluster nearest to a click, with what belongs to it."""
-    away = [distance(labels == i, target) for i in range(1, labels.max() + 1)]
-    doubt = _falling(min(away), 3.0, 15.0), "nothing stands where the click is"
-    return joined(labels, int(np.argmin(away)) + 1, view), doubt
+    """The cluster at a click, with what belongs to it.
+
+    A click may slip, or fall between the slats of a back: of the clusters that fill a quarter of
+    the disc around it, the nearest to the camera is meant.
+    """
+    away = np.array([distance(labels == i, target) for i in range(1, labels.max() + 1)])
+    doubt = _falling(away.min(), 3.0, 15.0), "nothing stands where the click is"
+    row, column = np.indices(labels.shape)
+    disc = np.hypot(row - target[0], column - target[1]) <= CLICK_RADIUS
+    shares = np.array([np.mean(labels[disc] == i) for i in range(1, labels.max() + 1)])
+    depths = [
+        np.median(view.z[disc & (labels == i + 1)]) if share >= 0.25 else np.inf
+        for i, share in enumerate(shares)
+    ]
+    hit = np.argmin(depths) if np.isfinite(depths).any() else np.argmin(away)
+    return joined(labels, int(hit) + 1, view), doubt
 
 
 def _most_central(

@@ -1,12 +1,9 @@
-import jax
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
 from analytic_room import CHAIR, CRATE, FLOOR, HEIGHT, TABLE, WALLS, WIDTH, K, iou, room
 
-from jaxshape.geometry.camera import Intrinsics
-from jaxshape.mapping.segmentation import Prompt, segment, segment_in_box
+from jaxshape.data.boxes import Box
+from jaxshape.mapping.segmentation import Prompt, segment, segment_inside
 
 GROUPS = [FLOOR, WALLS, CHAIR, CRATE, TABLE]
 COLORS = np.array([[90, 90, 95], [200, 190, 180], [120, 60, 30], [40, 90, 160], [30, 120, 60]])
@@ -174,23 +171,19 @@ def test_prompts_that_cannot_be_met_are_named(seen, prompt, said):
         segment(seen.depth, None, K, prompt)
 
 
-def test_a_known_box_segments_without_its_floor(seen):
-    T_world_object = np.eye(4)
-    T_world_object[1, 3] = 0.475
-    T = jaxlie.SE3.from_matrix(jnp.float32(np.linalg.inv(T_world_object) @ seen.T_world_camera))
-    intrinsics = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
-    half = jnp.array([0.24, 0.5, 0.24])
-    in_box = jax.jit(segment_in_box)
-    whole = in_box(jnp.asarray(seen.depth), intrinsics, T, half)
-    standing = in_box(jnp.asarray(seen.depth), intrinsics, T, half, jnp.float32(-0.475))
+def test_a_known_box_segments_what_lies_mostly_in_it(seen):
+    T_world_box = np.eye(4)
+    T_world_box[1, 3] = 0.475
     truth = seen.label == 2
-    assert iou(np.asarray(standing), truth) > 0.9
-    assert iou(np.asarray(standing), truth) > iou(np.asarray(whole), truth)
-    assert not np.asarray(standing)[seen.label == 0].any()
+    exact = Box(T_world_box, np.array([0.48, 1.0, 0.48]))
+    assert iou(segment_inside(seen.depth, K, exact, seen.T_world_camera), truth) > 0.9
+    # A box that is too small, or reaches into other things, still means the same object.
+    for size in ([0.4, 0.9, 0.4], [0.7, 1.2, 0.7]):
+        found = segment_inside(seen.depth, K, Box(T_world_box, np.array(size)), seen.T_world_camera)
+        assert iou(found, truth) > 0.9
 
-    shifted = T_world_object.copy()
-    shifted[0, 3] += 3
-    elsewhere = jaxlie.SE3.from_matrix(jnp.float32(np.linalg.inv(shifted) @ seen.T_world_camera))
-    assert not in_box(jnp.asarray(seen.depth), intrinsics, elsewhere, half).any()
-    nothing = jnp.array([[0.0, jnp.inf]])
-    assert not in_box(nothing, intrinsics, T, half * 100).any()
+    elsewhere = T_world_box.copy()
+    elsewhere[0, 3] += 3
+    far = Box(elsewhere, exact.size)
+    assert not segment_inside(seen.depth, K, far, seen.T_world_camera).any()
+    assert not segment_inside(0 * seen.depth, K, exact, seen.T_world_camera).any()
