@@ -26,10 +26,11 @@ Conventions, stated here once:
 Data moves one way, and so do imports:
 
     geometry   cameras, voxel frames, fusion of frames into F and M
-    data       meshes, procedural chairs, virtual depth camera, training pairs, RGB-D sequences
+    data       meshes, procedural chairs, virtual depth camera, training pairs, RGB-D recordings
     model      convolutions, auto-encoder, weights, training
     refine     objective (Eq. 7), refiners, the batched search, composed shapes
-    results    surfaces, metrics, evaluation, pictures, files
+    mapping    segmentation, the object's frame, ICP, keyframes, realignment of a recording
+    results    surfaces, metrics, evaluation, pictures, files, report and live view
     cli        the `jaxshape` command
 """
 

@@ -5,6 +5,11 @@ from .data.sequences import Trajectory, open_sequence, read_trajectory, write_tr
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
+from .mapping.config import MappingConfig, TrackingConfig
+from .mapping.incremental import Mapper, Shot, build_mapper
+from .mapping.placement import Placement, PlacementConfig, place
+from .mapping.recording import Progress, find_start, follow, trajectory
+from .mapping.segmentation import Prompt, Segmentation, segment
 from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
 from .model.config import Architecture
 from .model.weights import ShapePrior, load_prior, save_prior
@@ -28,6 +33,7 @@ from .refine.run import Refined, refine
 from .refine.space import LatentSpace, raw, whitened
 from .refine.stopping import Tolerances
 from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
+from .results.report import write_report
 from .results.surface import surface, write_mesh
 
 __all__ = [
@@ -37,19 +43,29 @@ __all__ = [
     "GridFrame",
     "Intrinsics",
     "LatentSpace",
+    "Mapper",
+    "MappingConfig",
     "Measurement",
+    "Placement",
+    "PlacementConfig",
     "PreparedDecoder",
+    "Progress",
+    "Prompt",
     "Reconstruction",
     "RefineConfig",
     "Refined",
     "Refiner",
+    "Segmentation",
     "ShapePrior",
+    "Shot",
     "StopReason",
     "Target",
     "Tolerances",
     "Trace",
+    "TrackingConfig",
     "Trajectory",
     "bounds",
+    "build_mapper",
     "build_refiner",
     "capture",
     "chamfer_l1",
@@ -59,9 +75,11 @@ __all__ = [
     "encode",
     "evosax_strategy",
     "f_score",
+    "find_start",
     "fit_box",
     "fit_box_isotropic",
     "fit_surface",
+    "follow",
     "gradient",
     "initialize",
     "iou",
@@ -76,6 +94,7 @@ __all__ = [
     "occupied",
     "open_sequence",
     "orbit",
+    "place",
     "polished",
     "prepare_decoder",
     "random_chair",
@@ -87,11 +106,14 @@ __all__ = [
     "refine",
     "refiner_for",
     "save_prior",
+    "segment",
     "shape_scores",
     "surface",
     "target",
+    "trajectory",
     "whitened",
     "with_restarts",
     "write_mesh",
+    "write_report",
     "write_trajectory",
 ]

@@ -4,11 +4,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from known_shape import install, known_shape
+from orbit_recording import Recording, record
 
+from jaxshape.data.boxes import read_box
+from jaxshape.data.sequences import open_sequence
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.incremental import build_mapper
+from jaxshape.mapping.recording import find_start, follow
+from jaxshape.mapping.segmentation import Prompt
 from jaxshape.model.autoencoder import initialize
 from jaxshape.model.config import Architecture
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine import objective, reconstruction, run
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.reconstruction import refiner_for
 
 
 @pytest.fixture(scope="session")
@@ -47,3 +57,51 @@ def linear_prior():
         patch.setattr(run, "prepare_decoder", lambda params: params)
         params = jax.random.normal(jax.random.key(5), (10, 32, 32, 32))
         yield ShapePrior(params, jnp.zeros(10), jnp.eye(10))
+
+
+@pytest.fixture(scope="session")
+def walk() -> Recording:
+    """A walk around a chair in a corner, with a Kinect's noise."""
+    return record()
+
+
+@pytest.fixture(scope="session")
+def known_prior(walk) -> ShapePrior:
+    return known_shape(walk.chair, walk.box.size)
+
+
+@pytest.fixture(scope="module")
+def known(known_prior):
+    """The network is replaced by one that knows the chair of the walk."""
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch.setattr, known_prior)
+        yield known_prior
+
+
+@pytest.fixture(scope="session")
+def session_mapper(known_prior):
+    """Compiled once; to be used where the network is replaced."""
+    search = RefineConfig(iterations=2)
+    mapping = MappingConfig(keyframe_iterations=2, keyframe_angle=14.0)  # eight keyframes at most
+    refiner = refiner_for("cma", known_prior, search)
+    return build_mapper(known_prior, refiner, search, mapping, TrackingConfig())
+
+
+@pytest.fixture(scope="module")
+def mapper(known, session_mapper):
+    return session_mapper
+
+
+@pytest.fixture(scope="module")
+def followed(known, mapper):
+    """Follow a recording to its end, with its box, and finish the map; the last progress."""
+
+    def followed(folder, *, chosen=None, use_poses=False):
+        sequence, box = open_sequence(folder), read_box(folder / "box.json")
+        start = find_start(sequence, known, Prompt(), box=box)
+        steps = follow(sequence, start, mapper, known, chosen=chosen, use_poses=use_poses)
+        last = list(steps)[-1]
+        state, shape = mapper.finish(last.state)
+        return last._replace(state=state, shape=shape)
+
+    return followed

@@ -6,7 +6,6 @@ of the code space is the shape, and codes add smooth waves to it.
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -14,7 +13,6 @@ import trimesh
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.meshes import sample_surface
 from jaxshape.geometry import grid
-from jaxshape.mapping import incremental
 from jaxshape.model import weights
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine import objective, reconstruction, run
@@ -45,10 +43,9 @@ def encode(params, occupied):
 def install(put, prior: ShapePrior) -> None:
     """Put the prior and its two maps in place of the network; `put(module, name, value)`."""
     put(reconstruction, "encode", encode)
-    for module in (reconstruction, objective, run, incremental):
+    for module in (reconstruction, objective, run):
         put(module, "decode", decode)
     put(run, "prepare_decoder", lambda params: params)
-    put(incremental, "_decode", jax.jit(lambda params, code: decode(params, code)))
     put(weights, "load_prior", partial(_loaded, prior))
 
 

@@ -18,10 +18,13 @@ from scene import write_scene
 
 from jaxshape import cli, process
 from jaxshape.cli.learning import preset_in
-from jaxshape.data import dataset
+from jaxshape.data import dataset, sequences
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.split import hold_out
+from jaxshape.mapping import incremental, recording
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.segmentation import Prompt
 from jaxshape.model import training, weights
 from jaxshape.model.config import PRESETS
 from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prior
@@ -81,10 +84,13 @@ assert "jax" not in sys.modules, "jax was imported"
 # --- bad input --------------------------------------------------------------------------------
 
 
+FRAMES = 3
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "frames"
-    write_scene(folder, random_chair(2, style="side chair"), frames=2)
+    write_scene(folder, random_chair(2, style="side chair"), frames=FRAMES)
     return folder
 
 
@@ -125,15 +131,6 @@ def rewrite_box(folder, **changed):
     (folder / "box.json").write_text(json.dumps(box | changed))
 
 
-def truncate(folder):
-    path = folder / "frame-000001.depth.png"
-    path.write_bytes(path.read_bytes()[:60])
-
-
-def shear(folder):
-    np.savetxt(folder / "frame-000001.pose.txt", np.diag([2.0, 1, 1, 1]))
-
-
 def in_metres(folder):
     for path in folder.glob("*.depth.png"):
         Image.fromarray((np.array(Image.open(path)) // 1000).astype(np.uint16)).save(path)
@@ -148,8 +145,6 @@ def move_the_box(folder):
 @pytest.mark.parametrize(
     "damage, said",
     [
-        (truncate, "cannot be read as an image"),
-        (shear, "expected a rigid motion"),
         (in_metres, "--depth-scale"),
         (move_the_box, "Nothing was measured inside the object's box"),
         (lambda folder: (folder / "box.json").write_text("{"), "cannot be read as JSON"),
@@ -164,8 +159,31 @@ def test_a_damaged_scan_is_refused(frames, refused, damage, said, linear_weights
 
 def test_a_missing_folder_or_box_is_refused(frames, refused, tmp_path, linear_weights):
     assert "is not a folder" in refused("reconstruct", tmp_path / "nowhere")
-    assert "give its box with --box" in refused("reconstruct", frames)
     assert "cannot be read" in refused("reconstruct", frames, "--box", tmp_path / "nowhere.json")
+
+
+def test_a_recording_in_which_nothing_stands_out_is_refused(frames, refused, linear_weights):
+    for path in frames.glob("*.depth.png"):
+        wall = np.full_like(np.array(Image.open(path)), 1500)
+        Image.fromarray(wall).save(path)
+    said = refused("reconstruct", frames)
+    assert "say where it is with --click, --region, --depth-range or --box" in said
+    assert "Nothing but floor, walls and table tops is seen" in said
+
+
+def test_poses_that_are_missing_or_inverted_are_refused(
+    frames, refused, linear_weights, monkeypatch
+):
+    some = ("reconstruct", frames, "--box", frames / "box.json")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sequences, "poses_look_inverted", lambda _: True)
+        for poses in ("auto", "given"):
+            said = refused(*some, "--poses", poses)
+            assert "look like world to camera" in said and "--poses none" in said
+    for path in frames.glob("*.pose.txt"):
+        path.unlink()
+    for poses in ("given", "first"):
+        assert f"--poses is {poses}, but" in refused(*some, "--poses", poses)
 
 
 @pytest.fixture(scope="module")
@@ -179,8 +197,20 @@ def chair(tmp_path_factory):
     "options, said",
     [
         (("--every", "0"), "--every is 0"),
-        (("--min-hits", "0"), "--min-hits is 0"),
+        (("--first", "-1"), "--first is -1"),
+        (("--first", "3"), "--first is 3, but there are 3 frames"),
         (("--depth-scale", "0"), "The depth scale is 0"),
+        (("--click", "48", "20"), "The click is at 48, 20"),
+        (("--region", "30", "0", "20", "10"), "holds no pixel of the image of 48 x 48"),
+        (("--depth-range", "2", "1"), "The depth range is (2.0, 1.0)"),
+        (("--min-hits", "0"), "--min-hits is 0"),
+        (("--keyframe-angle", "0"), "--keyframe-angle is 0"),
+        (("--keyframe-distance", "nan"), "--keyframe-distance is nan"),
+        (("--keyframe-iterations", "0"), "--keyframe-iterations is 0"),
+        (("--min-inliers", "1.5"), "--min-inliers is 1.5"),
+        (("--min-overlap", "-0.1"), "--min-overlap is -0.1"),
+        (("--max-angle", "0"), "--max-angle is 0"),
+        (("--max-distance", "inf"), "--max-distance is inf"),
     ],
 )
 def test_options_of_a_scan_out_of_range_are_refused(scene, refused, tmp_path, options, said, prior):
@@ -306,7 +336,9 @@ def test_a_missing_dataset_is_refused(refused, tmp_path):
 
 # --- what works -------------------------------------------------------------------------------
 
-RESULTS = {"mesh.glb", "grid.npz", "trace.npz", "overview.png", "result.json"}
+RESULTS = {
+    "mesh.glb", "mesh.ply", "grid.npz", "trace.npz", "overview.png", "result.json", "report.html"
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -315,24 +347,60 @@ def linear_weights(linear_prior, monkeypatch):
     monkeypatch.setattr(weights, "load_prior", lambda path=None: linear_prior)
 
 
-def test_reconstruct_writes_its_files(run, scene, tmp_path, linear_weights):
-    arguments = (scene, "--box", scene / "box.json", "--iterations", 2, "--output", tmp_path)
+def test_reconstruct_writes_its_files(run, frames, tmp_path, linear_weights):
+    """A damaged frame costs that frame alone, and is said."""
+    damaged = frames / "frame-000001.depth.png"
+    damaged.write_bytes(damaged.read_bytes()[:60])
+    output = tmp_path / "out"
+    few = ("--iterations", 2, "--keyframe-iterations", 1, "--min-hits", 1)
+    arguments = (frames, "--box", frames / "box.json", *few, "--output", output)
     status, out, err = run("reconstruct", *arguments)
     assert status == 0, err
-    assert {path.name for path in tmp_path.iterdir()} == RESULTS
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["frames"] == 2 and result["seconds"] > 0
+    of_recordings = {"keyframes", "keyframes.json", "trajectory.txt", "trajectory.log"}
+    assert {path.name for path in output.iterdir()} == RESULTS | of_recordings
+    result = json.loads((output / "result.json").read_text())
+    assert (result["frames"], result["keyframes"], result["frames_unreadable"]) == (3, 2, 1)
+    assert result["seconds"] > 0 and "running" not in result
     assert (result["iterations"], result["evaluations"]) == (2, 35)
     assert result["stop"] == "budget" and result["search"]["iterations"] == 2
     assert result["objective_refined"] <= result["objective_encoder"]
-    assert "objective:" in out and str(tmp_path) in out
+    assert result["warnings"] == []
+    assert "3 frames, 2 of them keyframes, 1 left out" in out
+    assert "frame-000001: unreadable" in err and "cannot be read as an image" in err
+    assert "objective:" in out and str(output) in out
 
-    status, out, err = run("plot", tmp_path)
-    assert status == 0 and str(tmp_path / "trace.png") in out, err
-    plot_search(tmp_path / "again.png", read_search(tmp_path))
-    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "trace.png").read_bytes()
-    status, out, err = run("plot", tmp_path, tmp_path, "--output", tmp_path / "compare.svg")
+    status, out, err = run("plot", output)
+    assert status == 0 and str(output / "trace.png") in out, err
+    plot_search(tmp_path / "again.png", read_search(output))
+    assert (tmp_path / "again.png").read_bytes() == (output / "trace.png").read_bytes()
+    status, out, err = run("plot", output, output, "--output", tmp_path / "compare.svg")
     assert status == 0 and (tmp_path / "compare.svg").exists(), err
+
+
+def test_options_reach_the_map_and_the_search_of_the_object(
+    run, scene, tmp_path, linear_weights, monkeypatch
+):
+    asked = {}
+
+    def build_mapper(prior, refiner, search, mapping, tracking, *, seed):
+        asked.update(search=search, mapping=mapping, tracking=tracking, seed=seed)
+
+    def find_start(sequence, prior, prompt, **options):
+        asked.update(prompt=prompt, options=options)
+        raise OSError("enough.")
+
+    monkeypatch.setattr(incremental, "build_mapper", build_mapper)
+    monkeypatch.setattr(recording, "find_start", find_start)
+    prompt = ("--click", 10, 20, "--region", 0, 0, 40, 40.5, "--depth-range", 0.5, 3)
+    tracking = ("--against", "keyframe", "--on", "object", "--min-inliers", 0.5, "--max-angle", 9)
+    mapping = ("--no-realign", "--isotropic", "--min-hits", 2, "--keyframe-angle", 7)
+    options = ("--poses", "none", "--first", 1, "--seed", 5, "--output", tmp_path)
+    status, _, err = run("reconstruct", scene, *prompt, *tracking, *mapping, *options)
+    assert status == 2 and "enough" in err, err
+    assert asked["prompt"] == Prompt((10.0, 20.0), (0.0, 0.0, 40.0, 40.5), (0.5, 3.0))
+    assert asked["tracking"] == TrackingConfig("keyframe", "object", 0.5, max_angle=9.0)
+    assert asked["mapping"] == MappingConfig(7.0, realign=False, isotropic=True, min_hits=2)
+    assert asked["options"] == {"box": None, "first": 1, "use_pose": False} and asked["seed"] == 5
 
 
 def test_plots_of_other_folders_are_refused(run, tmp_path):

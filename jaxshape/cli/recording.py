@@ -65,7 +65,15 @@ class Reconstruct(Rebuild):
         from jaxshape.mapping.incremental import build_mapper
         from jaxshape.mapping.recording import find_start, follow
         from jaxshape.mapping.segmentation import Prompt, check_prompt
-        from jaxshape.results.progress import load_state, remove_state, save_state, write_progress
+        from jaxshape.model.weights import fingerprint
+        from jaxshape.refine.reconstruction import require_measured
+        from jaxshape.results.progress import (
+            load_state,
+            observation_of,
+            remove_state,
+            save_state,
+            write_progress,
+        )
 
         require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
         require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")
@@ -89,6 +97,7 @@ class Reconstruct(Rebuild):
             "poses": self.poses,
             "frames": [self.first, self.every, len(sequence)],
             "depth_scale": sequence.depth_scale,
+            "prior": fingerprint(prior),
         }
         earlier = None
         if not self.fresh:
@@ -124,8 +133,8 @@ class Reconstruct(Rebuild):
                 earlier=earlier,
             ):
                 bar.update(task, completed=len(progress.logs), note=_note(progress))
-                if progress.logs[-1].status != "keyframe":
-                    continue
+                if progress.logs[-1].status != "keyframe" or progress.shape is None:
+                    continue  # what lies in the folder stays until something is measured
                 save_state(self.output, progress, settings)
                 if time.perf_counter() - written > _SECONDS_BETWEEN_WRITES:
                     seconds = {"seconds": round(time.perf_counter() - start, 2)}
@@ -138,6 +147,7 @@ class Reconstruct(Rebuild):
         with console.status("searching the space of shapes"):
             state, shape = mapper.finish(progress.state)
         progress = progress._replace(state=state, shape=shape)
+        require_measured(observation_of(state, mapping.min_hits).occupied)
         figures["seconds"] = round(time.perf_counter() - start, 2)
         result = write_progress(
             self.output, sequence, progress, figures, mapping.min_hits, running=False
@@ -165,13 +175,11 @@ class Reconstruct(Rebuild):
 
     def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
         """Draw what was found and say it."""
-        from jaxshape.refine.reconstruction import require_measured
         from jaxshape.results.output import draw
         from jaxshape.results.progress import observation_of
         from jaxshape.results.report import write_report
 
         observation = observation_of(progress.state, self.mapping.min_hits)
-        require_measured(observation.occupied)
         with console.status("drawing"):
             draw(self.output, observation, progress.shape, result)
             write_report(self.output)

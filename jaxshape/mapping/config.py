@@ -13,7 +13,7 @@ class TrackingConfig:
     on: Literal["scene", "object"] = "scene"
     """Align all pixels, where the camera moves through a still room; or those of the object, where
     it turns before a still camera."""
-    min_inliers: float = 0.6
+    min_inliers: float = 0.75
     """Share of the points, of those that should be seen again, that must agree."""
     min_overlap: float = 0.25
     """Share of the points that must be seen again."""
@@ -29,14 +29,14 @@ class MappingConfig:
 
     keyframe_angle: float = 10.0
     """Degrees between neighbouring keyframes, as seen from the object."""
-    keyframe_distance: float = 0.15
+    keyframe_distance: float = 0.25
     """Metres between neighbouring keyframes."""
     realign: bool = True
     """Realign all keyframes with the refined shape after each new one."""
     isotropic: bool = False
     """Scale all axes of the grid alike, as the paper does on real data, instead of filling the
     box."""
-    min_hits: int = 1
-    """Depth points that make a voxel occupied; more than 1 suppresses stray points."""
+    min_hits: int = 3
+    """Depth points that make a voxel occupied; the paper has 1, more suppress stray points."""
     keyframe_iterations: int = 40
     """Steps of the search after each keyframe, from the code found so far."""

@@ -37,13 +37,13 @@ from jaxshape.mapping.icp import Alignment, Cloud
 from jaxshape.mapping.realign import Odometry, realign
 from jaxshape.mapping.surfels import CELLS, Lattice, Sums, Surface
 from jaxshape.mapping.views import View, view_of
-from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import Reconstruction, reconstruct_jit
 from jaxshape.refine.refiner import Refiner
 
-_CAPACITIES = (8, 32, 128, 512)  # keyframes for which the realignment is compiled
+_CAPACITIES = (8, 16, 32, 64, 128, 256, 512)  # keyframes for which the realignment is compiled
+_JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess of the motion
 _STRIDE = 2  # pixels between the points that a keyframe keeps
 
 
@@ -184,7 +184,7 @@ def build_mapper(
         else:
             alignment, T = None, T_given
         motion = (state.T_world_camera.inverse() @ T).normalize()
-        moved_on = state._replace(T_world_camera=T, T_before_last=motion)
+        moved_on = state._replace(T_world_camera=T, T_before_last=_expected_again(motion))
         if not has_moved(state, T):
             return moved_on, Step("tracked", "", T, alignment, None, clock.seconds)
         if cut is not None:
@@ -306,23 +306,23 @@ def assemble(
     view: View,
     *,
     code: Float[Array, " d"] | None = None,
+    logits: Float[Array, "x y z"] | None = None,
     T_world_camera: jaxlie.SE3 | None = None,
     T_before_last: jaxlie.SE3 | None = None,
     poses_are_given: bool = False,
 ) -> State:
     """The state of a map with these keyframes, of whose last one `view` is.
 
-    `code` is that of the shape found so far, `T_world_camera` the pose of the last frame that was
-    tracked and `T_before_last` the motion before it, where there was one since.
+    `code` and `logits` are those of the shape found so far, `T_world_camera` the pose of the last
+    frame that was tracked and `T_before_last` the motion before it, where there was one since.
     """
-    logits = jnp.full((RESOLUTION,) * 3, -jnp.inf)
     state = State(
         keyframes=keyframes,
         place=place,
         measurement=fusion.nothing_measured(),
         sums=surfels.no_sums(),
         code=prior.code_mean if code is None else code,
-        logits=logits if code is None else _decode(prior.params, code),
+        logits=jnp.full((RESOLUTION,) * 3, -jnp.inf) if logits is None else logits,
         surface=_no_surface(place.lattice),
         view=view,
         T_world_camera=T_world_camera or keyframes[-1].T_world_camera,
@@ -330,11 +330,6 @@ def assemble(
         poses_are_given=poses_are_given,
     )
     return _with_surface(fused_anew(state))
-
-
-@jax.jit
-def _decode(params, code):
-    return decode(params, code[None])[0]
 
 
 def fused_anew(state: State) -> State:
@@ -379,10 +374,12 @@ def keyframe_of(
     place: Place,
     T_world_camera: jaxlie.SE3,
     odometry: tuple[jaxlie.SE3, Float[Array, "6 6"]] | None,
+    segmented: Bool[Array, "h w"] | None = None,
 ) -> Keyframe:
     """What the map keeps of a shot; `odometry` is its pose relative to the keyframe before, and the
-    information of that."""
-    segmented = _object_pixels(shot, place, T_world_camera)
+    information of that. The object's pixels are those in its box, unless they are given."""
+    if segmented is None:
+        segmented = _object_pixels(shot, place, T_world_camera)
     T_previous, information = odometry or (jaxlie.SE3.identity(), jnp.zeros((6, 6)))
     return Keyframe(
         depth=shot.view.depth,
@@ -485,6 +482,12 @@ def _composed_surface(lattice, sums, probability) -> Surface:
 @jax.jit
 def _no_surface(lattice) -> Surface:
     return surfels.measured_surface(lattice, surfels.no_sums())
+
+
+def _expected_again(motion: jaxlie.SE3) -> jaxlie.SE3:
+    """The motion, where the camera may go on so; none after a jump, as over missing frames."""
+    distance, angle = tracking.displacement(motion, jaxlie.SE3.identity())
+    return motion if distance < _JUMP[0] and angle < _JUMP[1] else jaxlie.SE3.identity()
 
 
 def _angle_about(center: np.ndarray, T_a: jaxlie.SE3, T_b: jaxlie.SE3) -> float:

@@ -68,6 +68,8 @@ class Start(NamedTuple):
     placement: Placement | None
     notes: tuple[str, ...]
     """What was found and how sure that is, in sentences."""
+    warnings: tuple[str, ...]
+    """Those of the notes that a user should look at."""
 
 
 class FrameLog(NamedTuple):
@@ -116,16 +118,20 @@ def find_start(
 
     Raises `SequenceError` where no frame is good enough.
     """
+    use_pose = use_pose and sequence.has_poses
     if box is not None:
         index, frame = _first_readable(sequence, first, use_pose)
         T = _world_pose(frame, use_pose)
-        return Start(index, frame.mask, box, T, None, np.nan, None, ("The box was given.",))
+        return Start(index, frame.mask, box, T, None, np.nan, None, (), ())
     reasons = []
     for index in range(first, min(first + FIRST_FRAMES, len(sequence))):
         try:
             frame = sequence[index]
         except SequenceError as problem:
             reasons.append(f"{sequence.names[index]}: {problem}")
+            continue
+        if use_pose and frame.T_world_camera is None:
+            reasons.append(f"{frame.name}: It has no pose.")
             continue
         found = segment(frame.depth, frame.color, sequence.intrinsics, prompt, frame.mask)
         if found.confidence >= (SURE_OF_PROMPT if _is_prompted(prompt) else SURE):
@@ -172,7 +178,9 @@ def _place_first(
 ) -> Start:
     T_world_camera = _world_pose(frame, use_pose)
     floor = _floor(frame, sequence, found)
-    up, note = _up(floor, T_world_camera, use_pose and sequence.has_poses)
+    up, of_up = _up(floor, T_world_camera, use_pose)
+    cut = f"{frame.name}: {found.reason}"
+    doubts = [cut] * (found.confidence < SURE) + [of_up] * (floor is None)
     T_level_world = np.eye(4)
     T_level_world[:3, :3] = _rotation_onto_y(up)
     shot = prepare(frame, sequence.intrinsics)
@@ -184,7 +192,8 @@ def _place_first(
         T_level_world=T_level_world,
         floor=_floor_height(floor, T_level_world @ T_world_camera),
         placement=None,
-        notes=(f"{frame.name}: {found.reason}", note),
+        notes=(cut, of_up),
+        warnings=tuple(doubts),
     )
     masked = _resized(found.segmented, shot.view.depth.shape)
     sights = [(shot.view.depth, masked, shot.view.intrinsics, T_world_camera)]
@@ -303,10 +312,10 @@ def _view(depth, intrinsics, halvings: int):
 
 
 def _resized(mask: Bool[np.ndarray, "h w"], shape: tuple[int, ...]) -> Bool[Array, "_ _"]:
-    """The mask at a whole fraction of its size: True where any of its pixels is."""
+    """The mask at a whole fraction of its size: True where most of the pixels are."""
     k = mask.shape[1] // shape[1]
     h, w = shape[0] * k, shape[1] * k
-    return jnp.asarray(mask[:h, :w].reshape(shape[0], k, shape[1], k).any(axis=(1, 3)))
+    return jnp.asarray(mask[:h, :w].reshape(shape[0], k, shape[1], k).mean(axis=(1, 3)) > 0.5)
 
 
 def follow(

@@ -74,7 +74,7 @@ def halved(
 def _smooth_rows(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Mean of the pixels around each on its row, those of other surfaces left out.
 
-    A pixel counts no more than the one opposite, or the mean at the end of a slope would lie off it.
+    A pixel counts no more than the one opposite: at the end of a slope the mean would lie off it.
     """
     scale = 3 * depth_deviation(depth) + JUMP / 3 * depth
     padded = jnp.pad(depth, ((0, 0), (2, 2)))

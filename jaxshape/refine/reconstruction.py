@@ -1,7 +1,7 @@
 """From measurements to shapes: first code, search, completed and composed grids (paper, Fig. 4)."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -137,8 +137,12 @@ def reconstruct(
     )
 
 
+@cache
 def reconstruct_jit(refiner: Refiner | None, config: RefineConfig) -> Callable[..., Reconstruction]:
-    """`reconstruct` with a fixed search, compiled once for each number of objects."""
+    """`reconstruct` with a fixed search, compiled once for each number of objects.
+
+    The same function for the same refiner and settings, so that who asks again need not compile.
+    """
     return jax.jit(partial(reconstruct, refiner=refiner, config=config))
 
 

@@ -29,7 +29,15 @@ from jaxshape.data.sequences import (
 )
 from jaxshape.files import atomic_path
 from jaxshape.geometry import fusion
-from jaxshape.mapping.incremental import Keyframe, Place, State, assemble, keyframe_of, place_of
+from jaxshape.mapping.incremental import (
+    Keyframe,
+    Place,
+    Shot,
+    State,
+    assemble,
+    keyframe_of,
+    place_of,
+)
 from jaxshape.mapping.placement import Placement
 from jaxshape.mapping.recording import FrameLog, Progress, Start, prepare, room, trajectory
 from jaxshape.model.weights import ShapePrior
@@ -52,10 +60,11 @@ def write_progress(
     _write_pictures(folder / "keyframes", sequence, progress)
     _write_trajectory(folder, sequence, progress)
     observation = observation_of(progress.state, min_hits)
-    result = {**figures, **counts(progress), "warnings": list(progress.start.notes)}
+    start = progress.start
+    result = {**figures, **counts(progress), "notes": start.notes, "warnings": start.warnings}
     result["box"] = {
-        "T_world_object": progress.start.box.T_world_object.tolist(),
-        "size": progress.start.box.size.tolist(),
+        "T_world_object": start.box.T_world_object.tolist(),
+        "size": start.box.size.tolist(),
     }
     if running:
         result["running"] = True
@@ -188,6 +197,7 @@ def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> No
                 "settings": settings,
                 "index": start.index,
                 "notes": start.notes,
+                "warnings": start.warnings,
                 "floor": start.floor,
                 "poses_are_given": state.poses_are_given,
                 "logs": [log._replace(T_keyframe_camera=None) for log in progress.logs],
@@ -198,6 +208,7 @@ def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> No
              for log in progress.logs]
         ),
         "code": state.code,
+        "logits": state.logits,
         "T_world_camera": state.T_world_camera.wxyz_xyz,
         "T_before_last": state.T_before_last.wxyz_xyz,
         "start": start.T_world_camera,
@@ -209,6 +220,10 @@ def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> No
         poses = [getattr(one, name).wxyz_xyz for one in state.keyframes]
         arrays[f"keyframes.{name}"] = np.stack(poses)
     arrays["keyframes.information"] = np.stack([one.information for one in state.keyframes])
+    # Which pixels they are depended on poses and boxes that are no more.
+    for name in ("masked", "segmented"):
+        pixels = np.stack([np.asarray(getattr(one, name)) for one in state.keyframes])
+        arrays[f"keyframes.{name}"] = np.packbits(pixels, axis=-1)
     if start.masked is not None:
         arrays["masked"] = start.masked
     if start.T_level_world is not None:
@@ -271,6 +286,7 @@ def _start(kept: dict[str, np.ndarray], about: dict[str, Any]) -> Start:
         if placed
         else None,
         notes=tuple(about["notes"]),
+        warnings=tuple(about["warnings"]),
     )
 
 
@@ -281,15 +297,18 @@ def _state(
     keyframes: list[Keyframe] = []
     view = None
     for number, index in enumerate(indices):
-        masked = start.masked if index == start.index else None
-        shot = prepare(sequence[index], sequence.intrinsics, masked)
-        view = shot.view
+        view = prepare(sequence[index], sequence.intrinsics).view
+        masked, segmented = (
+            jnp.asarray(np.unpackbits(packed, axis=-1, count=view.depth.shape[1]).astype(bool))
+            for packed in (kept[f"keyframes.{name}"][number] for name in ("masked", "segmented"))
+        )
         T, T_previous = (
             jaxlie.SE3(jnp.asarray(kept[f"keyframes.{name}"][number]))
             for name in ("T_world_camera", "T_previous_keyframe")
         )
         information = jnp.asarray(kept["keyframes.information"][number])
-        keyframes.append(keyframe_of(shot, place, T, (T_previous, information)))
+        odometry = T_previous, information
+        keyframes.append(keyframe_of(Shot(view, masked), place, T, odometry, segmented))
     assert view is not None
     return assemble(
         prior,
@@ -297,6 +316,7 @@ def _state(
         tuple(keyframes),
         view,
         code=jnp.asarray(kept["code"]),
+        logits=jnp.asarray(kept["logits"]),
         T_world_camera=jaxlie.SE3(jnp.asarray(kept["T_world_camera"])),
         T_before_last=jaxlie.SE3(jnp.asarray(kept["T_before_last"])),
         poses_are_given=about["poses_are_given"],

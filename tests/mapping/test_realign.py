@@ -22,12 +22,12 @@ def keyframes(noise, count=COUNT):
     clouds, poses = [], []
     for angle in 2 * np.pi * np.arange(count) / count:
         T = look_from((1.6 * np.sin(angle), 0.9, 1.6 * np.cos(angle)), (0, 0, 0))
-        p = rng.normal(size=(3000, 3))
+        p = rng.normal(size=(8000, 3))
         p *= axes / np.linalg.norm(p, axis=1, keepdims=True)
         n = p / axes**2
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         seen = np.sum((T[:3, 3] - p) * n, axis=1) > 0.3
-        p = p + noise * rng.normal(size=(3000, 1)) * n
+        p = p + noise * rng.normal(size=(8000, 1)) * n
         p, n = (p - T[:3, 3]) @ T[:3, :3], n @ T[:3, :3]
         deviation = np.where(seen, max(noise, 5e-4), np.inf)
         clouds.append(Cloud(*map(jnp.float32, (p, n, deviation))))

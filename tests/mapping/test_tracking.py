@@ -75,7 +75,7 @@ def test_a_wide_step_needs_many_guesses(azimuth):
     assert tracking.score(found) > tracking.score(alone)
 
 
-@pytest.mark.parametrize("by", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("by", [0.3, 0.6])
 def test_something_that_walks_through_the_picture_moves_the_pose_by_millimetres(by):
     walked = [((low[0] + by, *low[1:]), (high[0] + by, *high[1:])) for low, high in CRATE]
     second = seen_from(-5, (*FURNITURE[:-1], walked), seed=1)
