@@ -9,5 +9,7 @@ same weights and inputs, in turns with ours; what is compared with `baseline.jso
 carry over between machines far better than times do.
 """
 
-NAMES = ("fusion", "decode", "refinement", "training", "scaling", "startup", "precision")
+NAMES = (
+    "fusion", "decode", "refinement", "training", "scaling", "startup", "precision", "tracking"
+)  # fmt: skip
 """The benchmarks, in the order they run."""

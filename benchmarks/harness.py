@@ -22,7 +22,9 @@ ROOT = Path(__file__).parents[1]
 BURST = 0.03
 """Seconds that a function is called again and again before it is another one's turn."""
 
-PACKAGES = ("jaxshape", "jax", "jaxlib", "flax", "numpy", "torch", "cma", "evosax", "open3d")
+PACKAGES = (
+    "jaxshape", "jax", "jaxlib", "flax", "numpy", "torch", "cma", "evosax", "open3d", "small_gicp"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

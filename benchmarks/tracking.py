@@ -20,7 +20,8 @@ from jaxshape.data.boxes import Box
 from jaxshape.geometry import camera
 from jaxshape.mapping import icp, tracking
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.incremental import Shot, Step, build_mapper
+from jaxshape.mapping.incremental import Step, build_mapper
+from jaxshape.mapping.keyframes import Shot
 from jaxshape.mapping.views import View, view_of
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import refiner_for

@@ -32,8 +32,10 @@ from jaxshape.data.sequences import Sequence, open_sequence
 from jaxshape.files import atomic_path
 from jaxshape.mapping import icp
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.finding import find_start
 from jaxshape.mapping.incremental import Mapper, build_mapper
-from jaxshape.mapping.recording import Progress, as_pose, find_start, follow, prepare, trajectory
+from jaxshape.mapping.keyframes import as_pose, prepare
+from jaxshape.mapping.recording import Progress, follow, trajectory
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.mapping.tracking import displacement
 from jaxshape.model.weights import ShapePrior, load_prior

@@ -39,7 +39,8 @@ from jaxshape.data.capture import Capture, capture
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.incremental import Mapper, Shot, Step, build_mapper
+from jaxshape.mapping.incremental import Mapper, Step, build_mapper
+from jaxshape.mapping.keyframes import Shot
 from jaxshape.mapping.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
@@ -254,6 +255,7 @@ def plot(metrics: dict[str, Any], path: Path) -> None:
         shape.plot(np.arange(1, longest + 1), np.mean(curves, axis=1), style, color=color,
                    label=system)  # fmt: skip
     shape.set(xlabel="keyframes", ylabel="IoU of the composed shape, mean")
+    shape.xaxis.get_major_locator().set_params(integer=True)
     shape.legend(frameon=False)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150)

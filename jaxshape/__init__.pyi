@@ -6,9 +6,11 @@ from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
 from .mapping.config import MappingConfig, TrackingConfig
-from .mapping.incremental import Mapper, Shot, build_mapper
+from .mapping.finding import find_start
+from .mapping.incremental import Mapper, build_mapper
+from .mapping.keyframes import Shot
 from .mapping.placement import Placement, PlacementConfig, place
-from .mapping.recording import Progress, find_start, follow, trajectory
+from .mapping.recording import Progress, follow, trajectory
 from .mapping.segmentation import Prompt, Segmentation, segment
 from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
 from .model.config import Architecture

@@ -10,8 +10,9 @@ from orbit_recording import Recording, record
 from jaxshape.data.boxes import read_box
 from jaxshape.data.sequences import open_sequence
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.finding import find_start
 from jaxshape.mapping.incremental import build_mapper
-from jaxshape.mapping.recording import find_start, follow
+from jaxshape.mapping.recording import follow
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.model.autoencoder import initialize
 from jaxshape.model.config import Architecture

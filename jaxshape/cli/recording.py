@@ -62,8 +62,9 @@ class Reconstruct(Rebuild):
 
         from jaxshape.data.boxes import read_box
         from jaxshape.data.sequences import open_sequence
+        from jaxshape.mapping.finding import find_start
         from jaxshape.mapping.incremental import build_mapper
-        from jaxshape.mapping.recording import find_start, follow
+        from jaxshape.mapping.recording import follow
         from jaxshape.mapping.segmentation import Prompt, check_prompt
         from jaxshape.model.weights import fingerprint
         from jaxshape.refine.reconstruction import require_measured

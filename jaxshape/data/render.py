@@ -45,7 +45,8 @@ def fit_intrinsics(
     mesh: trimesh.Trimesh, T_object_camera: jaxlie.SE3, image_size: int = IMAGE_SIZE
 ) -> Intrinsics:
     """The longest lens with which every view sees the mesh's whole bounding box."""
-    reach = np.abs(_corner_slopes(mesh, np.asarray(T_object_camera.as_matrix()))).max()
+    corners = _corners(mesh, np.asarray(T_object_camera.as_matrix()))
+    reach = np.abs(corners[..., :2] / corners[..., 2:]).max()
     focal = (image_size / 2 - 1) / reach
     center = image_size / 2
     return Intrinsics(*jnp.array([focal, focal, center, center], jnp.float32))
@@ -85,22 +86,24 @@ def render_depth(
     return depth.reshape(shape), cosine.reshape(shape)
 
 
-def _corner_slopes(
+def _corners(
     mesh: trimesh.Trimesh, poses: Float[np.ndarray, "views 4 4"]
-) -> Float[np.ndarray, "views 8 2"]:
-    """x / z and y / z, in each camera, of the corners of the mesh's bounding box."""
+) -> Float[np.ndarray, "views 8 3"]:
+    """The corners of the mesh's bounding box in the frame of each camera."""
     offsets = trimesh.bounds.corners(mesh.bounds) - poses[:, None, :3, 3]
-    corners = offsets @ poses[:, :3, :3]  # the inverse of a rotation is its transpose
-    return corners[..., :2] / corners[..., 2:]
+    return offsets @ poses[:, :3, :3]  # the inverse of a rotation is its transpose
 
 
 def _may_hit(
     mesh: trimesh.Trimesh, poses: Float[np.ndarray, "views 4 4"], rays: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, "views n"]:
-    """Rays inside the rectangle that the mesh's bounding box covers in each image."""
-    slopes = _corner_slopes(mesh, poses)
+    """Rays inside the rectangle that the mesh's bounding box covers in each image, or all."""
+    corners = _corners(mesh, poses)
+    slopes = corners[..., :2] / corners[..., 2:]
     low, high = slopes.min(axis=1)[:, None], slopes.max(axis=1)[:, None]
-    return ((rays[:, :2] >= low) & (rays[:, :2] <= high)).all(axis=-1)
+    inside = ((rays[:, :2] >= low) & (rays[:, :2] <= high)).all(axis=-1)
+    # A box that reaches behind the camera covers no rectangle.
+    return inside | (corners[..., 2] <= 0).any(axis=1)[:, None]
 
 
 def add_sensor_noise(

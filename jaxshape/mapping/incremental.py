@@ -17,96 +17,45 @@ amount of memory, its depth image and one cloud. [host, around jitted parts]
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
-from jaxshape.data.boxes import Box, points_in_box
-from jaxshape.geometry import fusion, grid
-from jaxshape.geometry.camera import Intrinsics
-from jaxshape.geometry.fusion import Measurement
-from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.data.boxes import Box
 from jaxshape.mapping import icp, surfels, tracking
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.icp import Alignment, Cloud
-from jaxshape.mapping.realign import Odometry, realign
-from jaxshape.mapping.surfels import CELLS, Lattice, Sums, Surface
-from jaxshape.mapping.views import View, view_of
+from jaxshape.mapping.icp import Alignment
+from jaxshape.mapping.keyframes import (
+    Cut,
+    Keyframe,
+    Shot,
+    cut_anew,
+    keyframe_of,
+    object_pixels,
+    place_of,
+    view_again,
+)
+from jaxshape.mapping.state import (
+    State,
+    added,
+    assemble,
+    fused_anew,
+    grids_of,
+    no_surface,
+    odometry_of,
+    realigned_poses,
+    with_surface,
+)
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import Reconstruction, reconstruct_jit
 from jaxshape.refine.refiner import Refiner
 
-_CAPACITIES = (8, 16, 32, 64, 128, 256, 512)  # keyframes for which the realignment is compiled
 _JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess of the motion
-_STRIDE = 2  # pixels between the points that a keyframe keeps
-
-
-class Shot(NamedTuple):
-    """One frame, prepared for tracking and mapping."""
-
-    view: View
-    masked: Bool[Array, "h w"]
-    """Pixels that may show the object: a given mask, or all."""
-
-
-# Pixels that may show the object, from its box and the pose of the camera, both in the world.
-Cut = Callable[[Box, jaxlie.SE3], Bool[Array, "h w"]]
-
-
-class Keyframe(NamedTuple):
-    """What the map keeps of a frame."""
-
-    depth: Float[Array, "h w"]
-    masked: Bool[Array, "h w"]
-    """Pixels that may show the object: a given mask, or all."""
-    segmented: Bool[Array, "h w"]
-    """Those that do."""
-    intrinsics: Intrinsics
-    cloud: Cloud
-    """Oriented points of the object, in the frame of the camera."""
-    T_world_camera: jaxlie.SE3
-    T_previous_keyframe: jaxlie.SE3
-    """Relative to the keyframe before, as it was tracked."""
-    information: Float[Array, "6 6"]
-    """Of that relative pose, in the frame of the keyframe before; 0 for the first."""
-
-
-class Place(NamedTuple):
-    """Where the object's grids lie in the world."""
-
-    box: Box
-    cut: Box
-    """What lies in it is taken for the object."""
-    frame: GridFrame
-    lattice: Lattice
-
-
-class State(NamedTuple):
-    """All that the next step needs."""
-
-    keyframes: tuple[Keyframe, ...]
-    place: Place
-    measurement: Measurement
-    sums: Sums
-    code: Float[Array, " d"]
-    """Of the shape as last refined; the mean code before anything was measured."""
-    logits: Float[Array, "x y z"]
-    """Its decoded shape; -inf before anything was measured."""
-    surface: Surface
-    """What frames are tracked against."""
-    view: View
-    """Of the last keyframe."""
-    T_world_camera: jaxlie.SE3
-    """Of the last frame that was tracked."""
-    T_before_last: jaxlie.SE3
-    """How the camera moved to it from the frame before."""
-    poses_are_given: bool
 
 
 class Step(NamedTuple):
@@ -190,9 +139,9 @@ def build_mapper(
         if cut is not None:
             shot = shot._replace(masked=shot.masked & cut(state.place.cut, T))
             clock.lap("cut", shot)
-        new = keyframe_of(shot, state.place, T, _odometry(state, T, alignment))
+        new = keyframe_of(shot, state.place, T, odometry_of(state, T, alignment))
         state = moved_on._replace(keyframes=(*state.keyframes, new), view=shot.view)
-        state = _added(state, new)
+        state = added(state, new)
         clock.lap("fuse", state)
         state, shape = refine(state)
         clock.lap("refine", state)
@@ -206,7 +155,7 @@ def build_mapper(
         """The pose of a frame, and why it should not be believed."""
         T_expected = (state.T_world_camera @ state.T_before_last).normalize()
         pixels = _tracked_pixels(state, shot, T_expected)
-        surface = state.surface if track.against == "map" else _no_surface(state.place.lattice)
+        surface = state.surface if track.against == "map" else no_surface(state.place.lattice)
         T_keyframe = state.keyframes[-1].T_world_camera
         found = _register(shot.view, pixels, state.view, T_keyframe, surface, T_expected)
         reason = tracking.doubt(found, T_expected, track)
@@ -216,7 +165,7 @@ def build_mapper(
         center = jnp.float32(state.place.box.T_world_object[:3, 3])
         best = found
         for keyframe in _worth_trying(state.keyframes):
-            view = _view_of(keyframe.depth, keyframe.intrinsics)
+            view = view_again(keyframe.depth, keyframe.intrinsics)
             T_near = state.T_world_camera if keyframe is state.keyframes[-1] else None
             T_near = keyframe.T_world_camera if T_near is None else T_near
             again = _register_from(
@@ -232,7 +181,7 @@ def build_mapper(
     def _tracked_pixels(state: State, shot: Shot, T_expected: jaxlie.SE3) -> Bool[Array, "h w"]:
         if track.on == "scene":
             return jnp.ones_like(shot.masked)
-        return _object_pixels(shot, state.place, T_expected)
+        return object_pixels(shot, state.place, T_expected)
 
     def has_moved(state: State, T: jaxlie.SE3) -> bool:
         """Whether a frame shows the object from elsewhere than the last keyframe."""
@@ -244,17 +193,17 @@ def build_mapper(
 
     def refine(state: State, run=run_short) -> tuple[State, Reconstruction | None]:
         """The shape of what is fused so far, searched on from the one before."""
-        occupied, occluded = _grids(state.measurement, mapping.min_hits)
+        occupied, occluded = grids_of(state.measurement, mapping.min_hits)
         if not bool(occupied.any()):
             return state, None
         keys = jax.random.fold_in(key, len(state.keyframes))[None]
         shape = run(keys, prior, occupied[None], occluded[None], earlier=state.code[None])
         state = state._replace(code=shape.code[0], logits=shape.logits[0])
-        return _with_surface(state), shape
+        return with_surface(state), shape
 
     def realigned(state: State) -> State:
         """All keyframes moved to where they agree with each other and with the refined shape."""
-        T = _realigned_poses(state)
+        T = realigned_poses(state)
         moved = (T[-1] @ state.keyframes[-1].T_world_camera.inverse()).normalize()
         keyframes = tuple(
             one._replace(T_world_camera=pose) for one, pose in zip(state.keyframes, T, strict=True)
@@ -262,12 +211,12 @@ def build_mapper(
         state = state._replace(
             keyframes=keyframes, T_world_camera=(moved @ state.T_world_camera).normalize()
         )
-        return _with_surface(fused_anew(state))
+        return with_surface(fused_anew(state))
 
     def moved(state: State, box: Box, *, room: float = 0.0) -> tuple[State, Reconstruction | None]:
         """The same keyframes, mapped in another box."""
         place = place_of(box, room, isotropic=mapping.isotropic)
-        keyframes = tuple(_cut_anew(one, place) for one in state.keyframes)
+        keyframes = tuple(cut_anew(one, place) for one in state.keyframes)
         state = state._replace(place=place, keyframes=keyframes, code=prior.code_mean)
         return refine(fused_anew(state))
 
@@ -282,134 +231,6 @@ def build_mapper(
 
 
 # The parts ---------------------------------------------------------------------------------------
-
-
-def place_of(box: Box, room: float = 0.0, *, isotropic: bool = False) -> Place:
-    """The voxel frame and the lattice of the surface that fill a box.
-
-    The object is cut out by a box that is larger by the share `room`.
-    """
-    fit = grid.fit_box_isotropic if isotropic else grid.fit_box
-    frame = fit(jnp.float32(-box.size / 2), jnp.float32(box.size / 2))
-    R, t = box.T_world_object[:3, :3], box.T_world_object[:3, 3]
-    scale = CELLS / RESOLUTION / np.asarray(frame.voxel_size, np.float64)
-    linear = scale[:, None] * R.T
-    offset = -linear @ t - scale * np.asarray(frame.origin, np.float64)
-    cut = box._replace(size=(1 + room) * box.size)
-    return Place(box, cut, frame, Lattice(jnp.float32(linear), jnp.float32(offset)))
-
-
-def assemble(
-    prior: ShapePrior,
-    place: Place,
-    keyframes: tuple[Keyframe, ...],
-    view: View,
-    *,
-    code: Float[Array, " d"] | None = None,
-    logits: Float[Array, "x y z"] | None = None,
-    T_world_camera: jaxlie.SE3 | None = None,
-    T_before_last: jaxlie.SE3 | None = None,
-    poses_are_given: bool = False,
-) -> State:
-    """The state of a map with these keyframes, of whose last one `view` is.
-
-    `code` and `logits` are those of the shape found so far, `T_world_camera` the pose of the last
-    frame that was tracked and `T_before_last` the motion before it, where there was one since.
-    """
-    state = State(
-        keyframes=keyframes,
-        place=place,
-        measurement=fusion.nothing_measured(),
-        sums=surfels.no_sums(),
-        code=prior.code_mean if code is None else code,
-        logits=jnp.full((RESOLUTION,) * 3, -jnp.inf) if logits is None else logits,
-        surface=_no_surface(place.lattice),
-        view=view,
-        T_world_camera=T_world_camera or keyframes[-1].T_world_camera,
-        T_before_last=T_before_last or jaxlie.SE3.identity(),
-        poses_are_given=poses_are_given,
-    )
-    return _with_surface(fused_anew(state))
-
-
-def fused_anew(state: State) -> State:
-    """The state with F, M and the measured surface made from all keyframes where they are now."""
-    state = state._replace(measurement=fusion.nothing_measured(), sums=surfels.no_sums())
-    for keyframe in state.keyframes:
-        state = _added(state, keyframe)
-    return state
-
-
-def _added(state: State, keyframe: Keyframe) -> State:
-    """The state with one more keyframe fused into F, M and the measured surface."""
-    T_object_world = jaxlie.SE3.from_matrix(
-        jnp.float32(np.linalg.inv(state.place.box.T_world_object))
-    )
-    measurement, sums = _add(
-        state.measurement, state.sums, keyframe, T_object_world, state.place.frame,
-        state.place.lattice,
-    )  # fmt: skip
-    return state._replace(measurement=measurement, sums=sums)
-
-
-@jax.jit
-def _add(measurement, sums, keyframe: Keyframe, T_object_world, frame, lattice):
-    T_object_camera = T_object_world @ keyframe.T_world_camera
-    new = fusion.measure(
-        keyframe.depth, keyframe.segmented, keyframe.intrinsics, T_object_camera, frame
-    )
-    R = keyframe.T_world_camera.rotation().as_matrix()
-    points = keyframe.cloud.points @ R.T + keyframe.T_world_camera.translation()
-    more = surfels.add_up(lattice, points, keyframe.cloud.normals @ R.T, keyframe.cloud.deviation)
-    return fusion.merge(measurement, new), jax.tree.map(jnp.add, sums, more)
-
-
-@partial(jax.jit, static_argnums=1)
-def _grids(measurement: Measurement, min_hits: int):
-    return fusion.occupied(measurement, min_hits), fusion.occluded(measurement, min_hits)
-
-
-def keyframe_of(
-    shot: Shot,
-    place: Place,
-    T_world_camera: jaxlie.SE3,
-    odometry: tuple[jaxlie.SE3, Float[Array, "6 6"]] | None,
-    segmented: Bool[Array, "h w"] | None = None,
-) -> Keyframe:
-    """What the map keeps of a shot; `odometry` is its pose relative to the keyframe before, and the
-    information of that. The object's pixels are those in its box, unless they are given."""
-    if segmented is None:
-        segmented = _object_pixels(shot, place, T_world_camera)
-    T_previous, information = odometry or (jaxlie.SE3.identity(), jnp.zeros((6, 6)))
-    return Keyframe(
-        depth=shot.view.depth,
-        masked=shot.masked,
-        segmented=segmented,
-        intrinsics=shot.view.intrinsics,
-        cloud=_cloud(shot.view, segmented),
-        T_world_camera=T_world_camera,
-        T_previous_keyframe=T_previous,
-        information=information,
-    )
-
-
-def _cut_anew(keyframe: Keyframe, place: Place) -> Keyframe:
-    """The keyframe with the object cut out of it by another box."""
-    shot = Shot(_view_of(keyframe.depth, keyframe.intrinsics), keyframe.masked)
-    segmented = _object_pixels(shot, place, keyframe.T_world_camera)
-    return keyframe._replace(segmented=segmented, cloud=_cloud(shot.view, segmented))
-
-
-def _object_pixels(shot: Shot, place: Place, T_world_camera) -> Bool[Array, "h w"]:
-    """Pixels that may show the object and whose points lie in its box."""
-    T = np.asarray(T_world_camera.as_matrix(), np.float64)
-    points = np.asarray(shot.view.points, np.float64) @ T[:3, :3].T + T[:3, 3]
-    inside = points_in_box(points, place.cut) & (np.asarray(shot.view.points[..., 2]) > 0)
-    return shot.masked & inside
-
-
-_cloud = jax.jit(partial(icp.cloud_of, stride=_STRIDE))
-_view_of = jax.jit(view_of)
 
 
 @jax.jit
@@ -428,60 +249,6 @@ def _worth_trying(keyframes: tuple[Keyframe, ...], count: int = 4) -> list[Keyfr
     """The last keyframe, then some from all over the map."""
     others = np.unique(np.linspace(0, len(keyframes) - 2, count).astype(int))
     return [keyframes[-1], *(keyframes[i] for i in others if 0 <= i < len(keyframes) - 1)]
-
-
-def _odometry(state: State, T, alignment: Alignment | None):
-    """The new keyframe relative to the last, and the information of that."""
-    T_last = state.keyframes[-1].T_world_camera
-    information = jnp.zeros((6, 6))
-    if alignment is not None:
-        to_world = T_last.adjoint()
-        information = to_world.T @ alignment.information @ to_world
-    return (T_last.inverse() @ T).normalize(), information
-
-
-def _realigned_poses(state: State) -> list[jaxlie.SE3]:
-    count = len(state.keyframes)
-    capacity = next(n for n in _CAPACITIES if n >= count)
-    filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - count)]
-    clouds, T, T_previous, information = jax.tree.map(
-        lambda *x: jnp.stack(x),
-        *[(k.cloud, k.T_world_camera, k.T_previous_keyframe, k.information) for k in filled],
-    )
-    is_keyframe = np.arange(capacity) < count
-    information = jnp.where(jnp.asarray(is_keyframe)[:, None, None], information, 0)
-    center = jnp.float32(state.place.box.T_world_object[:3, 3])
-    T = _realign(
-        clouds, T, is_keyframe, state.place.lattice, jax.nn.sigmoid(state.logits),
-        Odometry(T_previous, information), np.arange(capacity) == 0, center,
-    )  # fmt: skip
-    return [jaxlie.SE3(T.wxyz_xyz[i]) for i in range(count)]
-
-
-@jax.jit
-def _realign(clouds, T, is_keyframe, lattice, probability, odometry, is_fixed, center):
-    # About the object, so that rotations have short arms and positions keep their digits.
-    near = Lattice(lattice.linear, lattice.offset + lattice.linear @ center)
-    to_near = jaxlie.SE3.from_translation(-center)
-    predicted = surfels.predicted_surface(near, probability)
-    T = realign(clouds, to_near @ T, is_keyframe, near, predicted, odometry, is_fixed)
-    return to_near.inverse() @ T
-
-
-def _with_surface(state: State) -> State:
-    surface = _composed_surface(state.place.lattice, state.sums, jax.nn.sigmoid(state.logits))
-    return state._replace(surface=surface)
-
-
-@jax.jit
-def _composed_surface(lattice, sums, probability) -> Surface:
-    measured = surfels.measured_surface(lattice, sums)
-    return surfels.composed_surface(measured, surfels.predicted_surface(lattice, probability))
-
-
-@jax.jit
-def _no_surface(lattice) -> Surface:
-    return surfels.measured_surface(lattice, surfels.no_sums())
 
 
 def _expected_again(motion: jaxlie.SE3) -> jaxlie.SE3:

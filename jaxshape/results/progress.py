@@ -13,6 +13,7 @@ Every file is replaced at once, when the new one is whole, so that `jaxshape vie
 import json
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
@@ -29,17 +30,11 @@ from jaxshape.data.sequences import (
 )
 from jaxshape.files import atomic_path
 from jaxshape.geometry import fusion
-from jaxshape.mapping.incremental import (
-    Keyframe,
-    Place,
-    Shot,
-    State,
-    assemble,
-    keyframe_of,
-    place_of,
-)
+from jaxshape.mapping.finding import Start, room
+from jaxshape.mapping.keyframes import Keyframe, Place, Shot, keyframe_of, place_of, prepare
 from jaxshape.mapping.placement import Placement
-from jaxshape.mapping.recording import FrameLog, Progress, Start, prepare, room, trajectory
+from jaxshape.mapping.recording import FrameLog, Progress, trajectory
+from jaxshape.mapping.state import State, assemble
 from jaxshape.model.weights import ShapePrior
 from jaxshape.results.output import Observation, write_shape
 
@@ -125,7 +120,7 @@ def _write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> Non
         if (folder / f"{log.name}.depth.png").exists():
             continue
         depth = np.asarray(keyframe.depth)
-        millimetres = np.where(np.isfinite(depth), depth * 1000, 0).clip(0, 65534)
+        millimetres = np.rint(np.where(np.isfinite(depth), depth * 1000, 0)).clip(0, 65534)
         _write_image(folder / f"{log.name}.depth.png", millimetres.astype(np.uint16))
         color = sequence[log.index].color
         if color is not None:
@@ -254,7 +249,7 @@ def load_state(
         with np.load(path) as file:
             kept = dict(file)
         about = json.loads(str(kept["about"]))
-    except (OSError, ValueError, KeyError) as problem:
+    except (OSError, EOFError, BadZipFile, ValueError, KeyError) as problem:
         raise SequenceError(
             f"{path} cannot be read ({problem}); remove it, or add --fresh to begin anew."
         ) from problem

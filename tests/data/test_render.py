@@ -46,6 +46,14 @@ def step_between(near, far):
     return depth
 
 
+def test_a_camera_inside_a_room_sees_its_walls_everywhere():
+    """The bounding box of what it sees reaches behind it."""
+    room = trimesh.creation.box(extents=(4.0, 4.0, 4.0))
+    depth, _ = render.render_depth(room, VIEWS, camera.intrinsics_for(60.0, SIZE), SIZE)
+    assert np.isfinite(depth).all()
+    np.testing.assert_allclose(depth[0], 3.5, atol=1e-5)  # 1.5 m in front of the middle
+
+
 def test_depth_of_a_box_is_that_of_the_slab_method():
     mesh = trimesh.creation.box((0.6, 0.4, 0.5))
     depth, _, origins, directions = rendered(mesh)

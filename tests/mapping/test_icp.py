@@ -268,7 +268,9 @@ def test_nothing_to_align_is_a_result_and_not_a_number_less(missing):
     if missing == "points":
         cloud = Cloud(*(0 * x for x in cloud[:2]), jnp.full(len(cloud.points), jnp.inf))
     else:
-        nothing = Matches(*(0 * x for x in cloud[:2]), *(jnp.full(300, x) for x in (jnp.inf, False)))
+        nothing = Matches(
+            *(0 * x for x in cloud[:2]), *(jnp.full(300, x) for x in (jnp.inf, False))
+        )
         match = lambda *_: nothing  # noqa: E731
     start = as_pose(motion(7))
     found = aligner(match)(cloud, start)
@@ -340,7 +342,10 @@ def test_points_match_what_a_view_shows_at_their_pixel():
 def test_several_references_agree_on_one_pose_and_count_each_point_once():
     cloud = CORNER.moved(motion(10, degrees=1, metres=0.005))
     both = aligner(icp.match_all(CORNER.match, CORNER.match), tolerance=ROUGH)
-    one, two = align_corner_roughly(cloud, jaxlie.SE3.identity()), both(cloud, jaxlie.SE3.identity())
+    one, two = (
+        align_corner_roughly(cloud, jaxlie.SE3.identity()),
+        both(cloud, jaxlie.SE3.identity()),
+    )
     for name in ("inlier_fraction", "overlap", "rmse", "conditioning"):
         np.testing.assert_allclose(getattr(one, name), getattr(two, name), rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(2 * one.information, two.information, rtol=1e-3, atol=1.0)
@@ -353,7 +358,7 @@ def test_small_gicp_finds_the_same_pose():
     small_gicp = pytest.importorskip("small_gicp")
     _, views = two_rooms()
     target, source = (np.float64(v.points[np.asarray(icp.is_oriented(v))]) for v in views)
-    theirs = small_gicp.align(target, source, downsampling_resolution=0.03,
-                              registration_type="GICP", max_correspondence_distance=0.2)  # fmt: skip
+    settings = {"registration_type": "GICP", "max_correspondence_distance": 0.2}
+    theirs = small_gicp.align(target, source, downsampling_resolution=0.03, **settings)
     metres, degrees = error(align_views(*views).T_reference_source, theirs.T_target_source)
     assert metres < 0.005 and degrees < 0.1

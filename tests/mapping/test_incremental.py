@@ -10,7 +10,8 @@ from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.mapping import incremental, surfels, tracking
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.incremental import Shot, build_mapper
+from jaxshape.mapping.incremental import build_mapper
+from jaxshape.mapping.keyframes import Shot
 from jaxshape.mapping.views import view_of
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import refiner_for
@@ -42,11 +43,13 @@ SHOTS = [shot(one.depth) for one in ROOMS]
 POSES = [as_pose(one.T_world_camera) for one in ROOMS]
 
 
-def build(prior):
-    search = RefineConfig(iterations=3, population=4)
-    settings = MappingConfig(keyframe_iterations=2, min_hits=1)
-    refiner = refiner_for("cma", prior, search)
-    return build_mapper(prior, refiner, search, settings, TrackingConfig())
+@pytest.fixture(scope="module")
+def build(shy_prior):
+    """Builds mappers that share what is compiled."""
+    search = RefineConfig(iterations=2, population=4)
+    settings = MappingConfig(keyframe_iterations=2, keyframe_distance=0.15, min_hits=1)
+    refiner = refiner_for("cma", shy_prior, search)
+    return lambda: build_mapper(shy_prior, refiner, search, settings, TrackingConfig())
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +59,8 @@ def shy_prior(linear_prior):
 
 
 @pytest.fixture(scope="module")
-def mapper(shy_prior):
-    return build(shy_prior)
+def mapper(build):
+    return build()
 
 
 def follow(mapper, shots, poses=None, **settings):
@@ -117,9 +120,7 @@ def test_the_map_is_what_all_its_keyframes_measure_at_once(run):
         measured = []
         for one in state.keyframes:
             T = as_pose(np.linalg.inv(T_WORLD_OBJECT)) @ one.T_world_camera
-            measured.append(
-                fuse(one.depth, one.segmented, one.intrinsics, T, state.place.frame)
-            )
+            measured.append(fuse(one.depth, one.segmented, one.intrinsics, T, state.place.frame))
         whole = fusion.merge_all(jax.tree.map(lambda *x: jnp.stack(x), *measured))
         assert_same(fusion.occupied(state.measurement), fusion.occupied(whole))
         assert_same(fusion.occluded(state.measurement), fusion.occluded(whole))
@@ -135,8 +136,8 @@ def test_the_map_is_what_all_its_keyframes_measure_at_once(run):
 fuse = jax.jit(fusion.measure)
 
 
-def test_two_runs_of_two_mappers_are_the_same(shy_prior, run):
-    again = follow(build(shy_prior), SHOTS)
+def test_two_runs_of_two_mappers_are_the_same(build, run):
+    again = follow(build(), SHOTS)
     assert_same(again[0][-1], run[0][-1])
     for a, b in zip(again[1], run[1], strict=True):
         assert (a.status, a.reason) == (b.status, b.reason)
@@ -196,11 +197,12 @@ def test_given_poses_are_kept_as_they_are(mapper):
     assert_same(finished.keyframes, states[-1].keyframes)
 
 
-def test_the_same_box_again_changes_nothing_of_what_was_measured(mapper, run):
+def test_the_same_box_again_keeps_what_was_measured(mapper, run):
     state = run[0][-1]
     same, _ = mapper.moved(state, BOX)
-    assert_same(fusion.occupied(same.measurement), fusion.occupied(state.measurement))
-    assert_same(fusion.occluded(same.measurement), fusion.occluded(state.measurement))
+    for grid_of in (fusion.occupied, fusion.occluded):  # cut out from where the cameras are now
+        a, b = (np.asarray(grid_of(one.measurement)) for one in (state, same))
+        assert (a != b).sum() <= 5 and a.sum() > 100
     assert_same([k.T_world_camera for k in same.keyframes],
                 [k.T_world_camera for k in state.keyframes])  # fmt: skip
 

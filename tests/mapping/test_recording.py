@@ -21,10 +21,11 @@ from jaxshape.data.boxes import read_box
 from jaxshape.data.sequences import SequenceError, open_sequence
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
-from jaxshape.mapping import recording
-from jaxshape.mapping.incremental import place_of
+from jaxshape.mapping import finding
+from jaxshape.mapping.finding import Start, find_start
+from jaxshape.mapping.keyframes import place_of
 from jaxshape.mapping.placement import Placement
-from jaxshape.mapping.recording import FrameLog, Progress, Start, find_start, trajectory
+from jaxshape.mapping.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.results.metrics import iou
 
@@ -244,7 +245,7 @@ def test_nothing_to_be_found_is_said_in_a_sentence(begin, copy, walk):
 def test_a_click_that_meets_nothing_ends_the_search(begin, copy, walk):
     """A place in one image means nothing in another."""
     write_depth(copy, 0, np.full_like(walk.depth[0], 1500))
-    with pytest.raises(SequenceError, match="frame-000000: Nothing but") as problem:
+    with pytest.raises(SequenceError, match="frame-000000: One cluster") as problem:
         begin(copy, Prompt(click=(64.0, 64.0)), box=False)
     assert "frame-000001" not in str(problem.value)
 
@@ -258,7 +259,7 @@ def test_a_found_object_stands_upright_and_without_the_floor(begin, copy, walk, 
         middle = jaxlie.SE3.from_translation(jnp.median(seen.surface, axis=0))
         return known._replace(T_world_object=middle, size=jnp.float32(walk.box.size))
 
-    monkeypatch.setattr(recording, "_place", place)
+    monkeypatch.setattr(finding, "_place", place)
     (copy / "frame-000000.pose.txt").unlink()  # in which world would it be?
     _, start = begin(copy, box=False)
     assert isinstance(start, Start) and isinstance(start.placement, Placement)
