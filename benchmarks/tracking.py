@@ -81,7 +81,7 @@ def registrations(quick: bool) -> list[Metric]:
             systems[name] = rival.variants()
     metrics = [Metric("tracking/compile", seconds, "s", note="view_of and register")]
     for scene in ("room", "chair"):
-        problem = list(pairs(scene, chairs=1 if quick else 3, starts=2))
+        problem = list(pairs(scene, chairs=1 if quick else 2, starts=2))
         outcomes = compare(problem, {
             (system, variant): way
             for system, ways in systems.items() for variant, way in ways.items()

@@ -72,15 +72,18 @@ def _image(depth, intrinsics):
 
 
 def _odometry(reference, frame, *, limit):
-    found = odometry.rgbd_odometry_multi_scale(
-        frame[0],
-        reference[0],
-        frame[1],
-        o3c.Tensor(np.eye(4)),
-        1.0,
-        FAR,
-        [odometry.OdometryConvergenceCriteria(n) for n in (20, 15, 10)],
-        odometry.Method.PointToPlane,
-        odometry.OdometryLossParams(depth_outlier_trunc=limit),
-    )
+    try:
+        found = odometry.rgbd_odometry_multi_scale(
+            frame[0],
+            reference[0],
+            frame[1],
+            o3c.Tensor(np.eye(4)),
+            1.0,
+            FAR,
+            [odometry.OdometryConvergenceCriteria(n) for n in (20, 15, 10)],
+            odometry.Method.PointToPlane,
+            odometry.OdometryLossParams(depth_outlier_trunc=limit),
+        )
+    except RuntimeError:  # where too few pixels match
+        return np.eye(4)
     return found.transformation.numpy()
