@@ -85,6 +85,7 @@ def checked_tracking(config: TrackingConfig) -> TrackingConfig:
     _require_each(
         config,
         ("min_inliers", 0 <= config.min_inliers <= 1, "a share from 0 to 1"),
+        ("sure_inliers", 0 <= config.sure_inliers <= 1, "a share from 0 to 1"),
         ("min_overlap", 0 <= config.min_overlap <= 1, "a share from 0 to 1"),
         ("max_angle", _positive(config.max_angle), "a number of degrees above 0"),
         ("max_distance", _positive(config.max_distance), "a number of metres above 0"),

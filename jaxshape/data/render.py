@@ -103,7 +103,7 @@ def _may_hit(
     low, high = slopes.min(axis=1)[:, None], slopes.max(axis=1)[:, None]
     inside = ((rays[:, :2] >= low) & (rays[:, :2] <= high)).all(axis=-1)
     # A box that reaches behind the camera covers no rectangle.
-    return inside | (corners[..., 2] <= 0).any(axis=1)[:, None]
+    return inside | np.any(corners[..., 2] <= 0, axis=1, keepdims=True)
 
 
 def add_sensor_noise(

@@ -15,6 +15,8 @@ class TrackingConfig:
     it turns before a still camera."""
     min_inliers: float = 0.75
     """Share of the points, of those that should be seen again, that must agree."""
+    sure_inliers: float = 0.9
+    """The same, below which many other guesses are tried: wrong poses explain up to that much."""
     min_overlap: float = 0.25
     """Share of the points that must be seen again."""
     max_angle: float = 35.0

@@ -159,7 +159,8 @@ def build_mapper(
         T_keyframe = state.keyframes[-1].T_world_camera
         found = _register(shot.view, pixels, state.view, T_keyframe, surface, T_expected)
         reason = tracking.doubt(found, T_expected, track)
-        if reason is None and found.converged:
+        is_sure = found.converged and found.inlier_fraction >= track.sure_inliers
+        if reason is None and is_sure:
             return found, None
         # From many guesses about the object, against the last keyframe, then against others.
         center = jnp.float32(state.place.box.T_world_object[:3, 3])

@@ -69,14 +69,14 @@ def errors(T, truth):
 # ------------------------------------------------------------------ what it finds
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.002])
-def test_moved_keyframes_come_back_to_where_they_agree(noise):
+@pytest.mark.parametrize("noise, angle", [(0.0, 0.1), (0.002, 0.6)])
+def test_moved_keyframes_come_back_to_where_they_agree(noise, angle):
     clouds, truth = keyframes(noise)
     start = perturbed(truth, np.random.default_rng(0))
     found = run(clouds, as_poses(start), ALL, LATTICE, NO_SHAPE, no_odometry(), FIRST_FIXED)
     before, after = errors(as_poses(start), truth), errors(found, truth)
     assert before[0].max() > 0.009 and before[1].max() > 0.9
-    assert after[0].max() < 0.003 and after[1].max() < 0.2
+    assert after[0].max() < 0.002 and after[1].max() < angle
     np.testing.assert_array_equal(found.wxyz_xyz[0], as_poses(start).wxyz_xyz[0])
 
 

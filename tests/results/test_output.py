@@ -60,7 +60,8 @@ def written(tmp_path_factory):
 
 def test_the_files_are_there_and_nothing_else(written):
     names = {path.name for path in written[0].iterdir()}
-    assert names == {"mesh.glb", "grid.npz", "trace.npz", "overview.png", "result.json"}
+    files = {"mesh.glb", "mesh.ply", "grid.npz", "trace.npz", "overview.png", "result.json"}
+    assert names == files
 
 
 def test_the_result_holds_the_figures_and_the_scores(written):
