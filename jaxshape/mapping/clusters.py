@@ -49,7 +49,7 @@ Image = Bool[np.ndarray, "h w"]
 Pixel = tuple[float, float]
 
 
-class View(NamedTuple):
+class Scene(NamedTuple):
     """A depth frame reduced to the working width, and its planes."""
 
     stride: int
@@ -67,7 +67,7 @@ class View(NamedTuple):
         return self.points[..., 2]
 
 
-def look(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> View:
+def look(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> Scene:
     """The reduced frame, its planes, and the floor among them."""
     stride = max(1, round(depth.shape[1] / WORKING_WIDTH))
     points = reduced(camera_points(depth, K), stride)
@@ -76,7 +76,7 @@ def look(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> View:
     floor = floor_plane(cloud, planes)
     if floor is not None and floor.confidence < SURE_FLOOR:
         floor = None
-    return View(stride, points, stride / float(K[0, 0]), planes, floor)
+    return Scene(stride, points, stride / float(K[0, 0]), planes, floor)
 
 
 def reduced(image: np.ndarray, stride: int) -> np.ndarray:
@@ -84,7 +84,7 @@ def reduced(image: np.ndarray, stride: int) -> np.ndarray:
     return image[stride // 2 :: stride, stride // 2 :: stride]
 
 
-def enlarged(segmented: Image, view: View, depth: Float[np.ndarray, "H W"]) -> np.ndarray:
+def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> np.ndarray:
     """A segmentation at full size: each pixel is as that, of those around it, nearest in depth."""
     (h, w), stride = segmented.shape, view.stride
     if stride == 1:
@@ -103,7 +103,7 @@ def enlarged(segmented: Image, view: View, depth: Float[np.ndarray, "H W"]) -> n
 # What is not the object ------------------------------------------------------------------------
 
 
-def background(view: View, click: Pixel | None) -> Image:
+def background(view: Scene, click: Pixel | None) -> Image:
     """True on and behind floor and walls, and on table tops, unless they were clicked on."""
     floor = None if view.floor is None else view.floor.plane
     found = np.zeros(view.z.shape, bool) if floor is None else _beyond(view, floor)
@@ -123,7 +123,7 @@ def background(view: View, click: Pixel | None) -> Image:
     return found
 
 
-def _beyond(view: View, plane: Plane) -> Image:
+def _beyond(view: Scene, plane: Plane) -> Image:
     """True on a plane and behind it."""
     return height_above(plane, view.points) < tolerance(view.z)
 
@@ -143,7 +143,7 @@ def _shorter_side(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.sqrt(12 * np.linalg.eigvalsh(np.cov(points.T))[1]))
 
 
-def _is_wall(plane: Plane, parts: list[Image], sides: list[float], view: View) -> bool:
+def _is_wall(plane: Plane, parts: list[Image], sides: list[float], view: Scene) -> bool:
     """Large, cut by the border of the image, and with next to nothing seen behind it."""
     large = any(side > WALL and cut(part) > 0 for part, side in zip(parts, sides, strict=True))
     return large and nothing_below(plane, view.points.reshape(-1, 3)) > 0
@@ -164,7 +164,7 @@ def cut(segmented: Image) -> float:
 # Clusters --------------------------------------------------------------------------------------
 
 
-def clusters(view: View, free: Image) -> Int[np.ndarray, "h w"]:
+def clusters(view: Scene, free: Image) -> Int[np.ndarray, "h w"]:
     """Connected free pixels without a jump in depth between them: 1, 2, ...; 0 elsewhere."""
     index = np.arange(free.size).reshape(free.shape)
     across = free[:, 1:] & free[:, :-1] & ~jumps(view.z[:, 1:], view.z[:, :-1], view.spacing)
@@ -185,7 +185,7 @@ def jumps(
     return np.abs(z - other) > tolerance(nearer) + 2.5 * spacing * nearer
 
 
-def joined(labels: Int[np.ndarray, "h w"], main: int, view: View) -> list[int]:
+def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
     """The main cluster, and those that belong to it: legs and slats which its own parts cut off.
 
     Clusters belong together if most of one stands on the footprint of the other, which is no larger

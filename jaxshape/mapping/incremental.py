@@ -218,8 +218,16 @@ def build_mapper(
         """The same keyframes, mapped in another box."""
         place = place_of(box, room, isotropic=mapping.isotropic)
         keyframes = tuple(cut_anew(one, place) for one in state.keyframes)
-        state = state._replace(place=place, keyframes=keyframes, code=prior.code_mean)
-        return refine(fused_anew(state))
+        anew = assemble(
+            prior,
+            place,
+            keyframes,
+            state.view,
+            T_world_camera=state.T_world_camera,
+            T_before_last=state.T_before_last,
+            poses_are_given=state.poses_are_given,
+        )
+        return refine(anew)
 
     def finish(state: State) -> tuple[State, Reconstruction | None]:
         """Realign once more, and search as long as the settings allow; no shape where nothing was

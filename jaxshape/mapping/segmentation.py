@@ -19,7 +19,7 @@ from skimage.measure import label
 from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.mapping.clusters import (
     Pixel,
-    View,
+    Scene,
     background,
     clusters,
     cut,
@@ -35,7 +35,6 @@ from jaxshape.mapping.planes import Plane, floor_plane, height_above, subsample,
 
 SEPARABLE = 0.95
 """Colours tell the object from the floor if they put this share of known pixels where they are."""
-
 
 CLICK_RADIUS = 4.0
 """Pixels of the reduced image around a click that may be meant."""
@@ -191,7 +190,7 @@ def _prompted(prompt: Prompt, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarra
     return within & (near <= depth) & (depth <= far)
 
 
-def _target(prompt: Prompt, view: View) -> Pixel:
+def _target(prompt: Prompt, view: Scene) -> Pixel:
     """Where in the reduced image, as row and column, the object is expected."""
     h, w = view.z.shape
     if prompt.click is not None:
@@ -204,7 +203,7 @@ def _target(prompt: Prompt, view: View) -> Pixel:
     return v / view.stride - 0.5, u / view.stride - 0.5
 
 
-def _nearest(labels: Int[np.ndarray, "h w"], view: View, target: Pixel) -> tuple[list[int], Doubt]:
+def _nearest(labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel) -> tuple[list[int], Doubt]:
     """The cluster at a click, with what belongs to it.
 
     A click may slip, or fall between the slats of a back: of the clusters that fill a quarter of
@@ -224,7 +223,7 @@ def _nearest(labels: Int[np.ndarray, "h w"], view: View, target: Pixel) -> tuple
 
 
 def _most_central(
-    labels: Int[np.ndarray, "h w"], view: View, target: Pixel
+    labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel
 ) -> tuple[list[int], Doubt]:
     """Of the clusters, with what belongs to each, that which is worth most.
 
@@ -250,7 +249,7 @@ def _most_central(
 
 
 def _feet(
-    segmented: Bool[np.ndarray, "h w"], color: UInt8[np.ndarray, "h w 3"], view: View, floor: Plane
+    segmented: Bool[np.ndarray, "h w"], color: UInt8[np.ndarray, "h w 3"], view: Scene, floor: Plane
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels that were taken for floor, but have the colour of the object above or beside them.
 
@@ -306,7 +305,7 @@ def _looks_like(
 def _doubts(
     segmented: Bool[np.ndarray, "h w"],
     behind: Bool[np.ndarray, "h w"],
-    view: View,
+    view: Scene,
     *,
     clicked: bool,
 ) -> list[Doubt]:
@@ -332,7 +331,7 @@ def _falling(value: float, sure: float, unsure: float) -> float:
 
 
 def _outline(
-    segmented: Bool[np.ndarray, "h w"], behind: Bool[np.ndarray, "h w"], view: View
+    segmented: Bool[np.ndarray, "h w"], behind: Bool[np.ndarray, "h w"], view: Scene
 ) -> tuple[float, float]:
     """Shares of the outline at which something nearer begins, and at which the surface goes on."""
     nearer = touching = total = 0
@@ -347,7 +346,7 @@ def _outline(
     return nearer / max(total, 1), touching / max(total, 1)
 
 
-def _standing(segmented: Bool[np.ndarray, "h w"], view: View) -> float:
+def _standing(segmented: Bool[np.ndarray, "h w"], view: Scene) -> float:
     """How sure it is that the object stands on the floor; half where no floor is seen."""
     if view.floor is None:
         return 0.5
