@@ -27,6 +27,9 @@ SURE = 0.5
 SURE_OF_PROMPT = 0.1
 """The same where the user said what to look at."""
 
+SURE_OF_FRONT = 0.01
+"""Nats per point by which a box that is turned otherwise must be worse."""
+
 FIRST_FRAMES = 10
 """Frames among which the first that shows the object well is looked for."""
 
@@ -155,7 +158,21 @@ def _place_first(
     )
     masked = resized(found.segmented, shot.view.depth.shape)
     sights = [(shot.view.depth, masked, shot.view.intrinsics, T_world_camera)]
-    return _placed(start, prior, sights)
+    start = _placed(start, prior, sights)
+    if start.placement is None:
+        raise SequenceError(
+            f"{frame.name}: the object was cut out, but too little of it to place it; give another "
+            "--first frame, --click elsewhere, or its --box."
+        )
+    return _with_doubt_of_front(start)
+
+
+def _with_doubt_of_front(start: Start) -> Start:
+    assert start.placement is not None
+    if start.placement.margin >= SURE_OF_FRONT:
+        return start
+    doubt = "Its front is not sure: it is symmetric, or was first seen from where that is hidden."
+    return start._replace(notes=(*start.notes, doubt), warnings=(*start.warnings, doubt))
 
 
 def _floor(frame: Frame, sequence: Sequence, found: Segmentation) -> Floor | None:
@@ -209,6 +226,7 @@ def placed_again(start: Start, prior: ShapePrior, keyframes: tuple[Keyframe, ...
 
 
 def _placed(start: Start, prior: ShapePrior, sights: list) -> Start:
+    """The start with the box that the prior finds; as it is where nothing can be placed."""
     assert start.T_level_world is not None
     known = start.placement or placement.nothing_known(prior)
     each = [
@@ -218,6 +236,8 @@ def _placed(start: Start, prior: ShapePrior, sights: list) -> Start:
     poses = [as_pose(start.T_level_world @ T_world_camera) for *_, T_world_camera in sights]
     seen = _pooled(_stacked(each), _stacked(poses))
     found = _place(prior, seen, jnp.float32(start.floor), known)
+    if not np.isfinite(found.misfit):
+        return start
     T_level_object = np.asarray(found.T_world_object.as_matrix(), np.float64)
     box = Box(np.linalg.inv(start.T_level_world) @ T_level_object, np.asarray(found.size, float))
     return start._replace(placement=found, box=_without_floor(box, start.floor))

@@ -1,6 +1,6 @@
 """Incremental tracking and mapping (paper, section 3.4): pure functions over the state of one map.
 
-    mapper = build_mapper(prior, search, MappingConfig(), TrackingConfig())
+    mapper = build_mapper(prior, refiner, search, MappingConfig(), TrackingConfig())
     state, step = mapper.init(shot, box, T_world_camera)
     for shot in shots:
         state, step = mapper.step(state, shot)
@@ -167,8 +167,8 @@ def build_mapper(
         best = found
         for keyframe in _worth_trying(state.keyframes):
             view = view_again(keyframe.depth, keyframe.intrinsics)
-            T_near = state.T_world_camera if keyframe is state.keyframes[-1] else None
-            T_near = keyframe.T_world_camera if T_near is None else T_near
+            is_last = keyframe is state.keyframes[-1]
+            T_near = state.T_world_camera if is_last else keyframe.T_world_camera
             again = _register_from(
                 shot.view, pixels, view, keyframe.T_world_camera, surface, T_near, center
             )

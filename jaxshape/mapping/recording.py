@@ -1,7 +1,7 @@
 """A recording from its first frame to its last. [host]
 
     start = find_start(sequence, prior, Prompt(click=(320, 240)))
-    for progress in follow(sequence, start, mapper):
+    for progress in follow(sequence, start, mapper, prior):
         ...                              # after every frame; write, draw, or stop and go on later
     state, reconstruction = mapper.finish(progress.state)
 

@@ -256,8 +256,12 @@ def test_a_found_object_stands_upright_and_without_the_floor(begin, copy, walk, 
 
     def place(prior, seen, floor, known):
         asked.append((seen, float(floor)))
-        middle = jaxlie.SE3.from_translation(jnp.median(seen.surface, axis=0))
-        return known._replace(T_world_object=middle, size=jnp.float32(walk.box.size))
+        return known._replace(
+            T_world_object=jaxlie.SE3.from_translation(jnp.median(seen.surface, axis=0)),
+            size=jnp.float32(walk.box.size),
+            misfit=jnp.float32(0.1),
+            margin=jnp.float32(0.1),
+        )
 
     monkeypatch.setattr(finding, "_place", place)
     (copy / "frame-000000.pose.txt").unlink()  # in which world would it be?
@@ -276,3 +280,16 @@ def test_a_found_object_stands_upright_and_without_the_floor(begin, copy, walk, 
     bottom = start.box.exclude[0, 1, 1] + start.box.size[1] / 2
     assert bottom == pytest.approx(0.02, abs=1e-6)
     assert "floor" in start.notes[1] and start.notes[0].startswith("frame-000001: ")
+
+
+def test_a_box_that_is_not_sure_is_said_and_none_is_refused(begin, folder, monkeypatch):
+    def symmetric(prior, seen, floor, known):
+        return known._replace(misfit=jnp.float32(0.1), margin=jnp.float32(0.001))
+
+    monkeypatch.setattr(finding, "_place", symmetric)
+    _, start = begin(folder, box=False)
+    assert any("front is not sure" in warning for warning in start.warnings)
+
+    monkeypatch.setattr(finding, "_place", lambda prior, seen, floor, known: known)
+    with pytest.raises(SequenceError, match="too little of it to place it"):
+        begin(folder, box=False)
