@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxshape.mapping.icp import Cloud, robust_weight
-from jaxshape.mapping.surfels import CELLS, Lattice, Surface, cell_of
+from jaxshape.mapping.surfels import CELLS, FLAT, Lattice, Surface, cell_of
 
 OCCUPIED_CELLS = 12288
 """Cells that take part at most."""
@@ -36,7 +36,7 @@ SHAPE_CORRELATION = 1 / 1000
 _PATCH_DEVIATION = 0.002  # metres: of a keyframe's mean in a cell, however many points it has
 _ITERATIONS = 8
 _ROUGH = 0.01  # metres added to the deviations at first; halved in each step
-_FLAT = 0.8  # least length of a cell's mean normal
+_PARALLEL = 0.8  # least cosine between the normals of a cell and of the refined shape
 
 
 class Odometry(NamedTuple):
@@ -112,7 +112,7 @@ def _observe(clouds: Cloud, T: jaxlie.SE3, is_keyframe, lattice: Lattice) -> _Ob
     weight, total = sums[..., 0], sums.sum(axis=1)
     normal = total[:, 4:] / jnp.maximum(total[:, :1], 1e-6)
     length = jnp.linalg.norm(normal, axis=-1)
-    seen = (weight > 0) & (length > _FLAT)[:, None]
+    seen = (weight > 0) & (length > FLAT)[:, None]
     safe = jnp.where(weight > 0, weight, 1)
     variance = jnp.where(seen, 1 / safe + _PATCH_DEVIATION**2, jnp.inf)
     mean = sums[..., 1:4] / safe[..., None]
@@ -157,7 +157,7 @@ def _heights_of_shape(predicted: Surface, middle, normal, tolerance):
     q = predicted.points.at[near].get(mode="fill", fill_value=0.0)
     q_normal = predicted.normals.at[near].get(mode="fill", fill_value=0.0)
     q_deviation = predicted.deviation.at[near].get(mode="fill", fill_value=jnp.inf)
-    agrees = jnp.abs(jnp.sum(q_normal * normal, axis=-1)) > _FLAT
+    agrees = jnp.abs(jnp.sum(q_normal * normal, axis=-1)) > _PARALLEL
     variance = (q_deviation**2 + tolerance**2) / SHAPE_CORRELATION
     height = jnp.sum((q - middle) * normal, axis=-1)
     return height, jnp.where(agrees, variance, jnp.inf)

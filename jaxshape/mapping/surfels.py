@@ -19,11 +19,13 @@ from jaxshape.mapping.icp import AGREEING, Match, Matches
 CELLS = 2 * RESOLUTION
 """Cells along each axis: half a voxel each, some 1.5 cm on a chair."""
 
+FLAT = 0.8
+"""Least length of a cell's mean normal: below, several faces share the cell."""
+
 PREDICTED_DEVIATION = 0.35
 """Standard deviation of the predicted surface, in voxels of the decoded grid."""
 
 _MEASURED_DEVIATION = 0.05  # in cells: what a plane leaves of the surface inside one
-_FLAT = 0.8  # least length of a cell's mean normal: below, several faces share the cell
 _REACH = 3  # cells within which points find a patch
 _PATCHES = 4096  # of a predicted surface at most
 
@@ -107,7 +109,7 @@ def measured_surface(lattice: Lattice, sums: Sums) -> Surface:
     weight = jnp.where(has_points, sums.weight, 1)[:, None]
     mean_normal = sums.normal / weight
     length = jnp.linalg.norm(mean_normal, axis=-1)
-    is_patch = has_points & (length > _FLAT)
+    is_patch = has_points & (length > FLAT)
     floor = _MEASURED_DEVIATION * cell_size(lattice)
     deviation = jnp.sqrt(1 / weight[:, 0] + floor**2)
     return Surface(
