@@ -1,5 +1,7 @@
 """Shape priors small enough for tests: a tiny network, and a linear one that compiles at once."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from known_shape import install, known_shape
 from orbit_recording import Recording, record
 
+from jaxshape import cli
 from jaxshape.data.boxes import read_box
 from jaxshape.data.sequences import open_sequence
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
@@ -106,3 +109,21 @@ def followed(known, mapper):
         return last._replace(state=state, shape=shape)
 
     return followed
+
+
+@pytest.fixture(name="run")
+def run_command(monkeypatch, capsys):
+    """Run a command in this process; returns its exit status, its answer and its complaint."""
+    monkeypatch.setattr(cli, "prepare_process", lambda: None)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["jaxshape", *map(str, arguments)])
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as stop:
+            status = stop.code or 0
+        out, err = capsys.readouterr()
+        return status, out, " ".join(err.split())
+
+    return run

@@ -36,24 +36,6 @@ from jaxshape.results.traces import read_search
 COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
 
 
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Run a command in this process; returns its exit status, its answer and its complaint."""
-    monkeypatch.setattr(cli, "prepare_process", lambda: None)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["jaxshape", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as stop:
-            status = stop.code or 0
-        out, err = capsys.readouterr()
-        return status, out, " ".join(err.split())
-
-    return run
-
-
 # --- help -------------------------------------------------------------------------------------
 
 

@@ -21,7 +21,6 @@ from orbit_recording import (
     write_recording,
 )
 
-from jaxshape import cli
 from jaxshape.cli import recording as command
 from jaxshape.data.sequences import read_trajectory
 from jaxshape.geometry import fusion
@@ -174,24 +173,11 @@ OPTIONS = ("--iterations", "3", "--keyframe-iterations", "2", "--min-hits", "1")
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, known):
+def run(run, monkeypatch, known):
     """Run `reconstruct` in this process; returns its exit status, its answer and its complaint."""
-    monkeypatch.setattr(cli, "prepare_process", lambda: None)
     monkeypatch.setattr(output, "draw", lambda *_: None)
     monkeypatch.setattr(report, "write_report", lambda *_: None)
-
-    def run(folder, *options):
-        arguments = ("reconstruct", folder, *OPTIONS, *options)
-        monkeypatch.setattr(sys, "argv", ["jaxshape", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as stop:
-            status = stop.code or 0
-        out, err = capsys.readouterr()
-        return status, out, " ".join(err.split())
-
-    return run
+    return lambda folder, *options: run("reconstruct", folder, *OPTIONS, *options)
 
 
 @pytest.fixture
