@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import settings
 from known_shape import install, known_shape
 from orbit_recording import Recording, record
 
@@ -23,6 +24,9 @@ from jaxshape.model.weights import ShapePrior
 from jaxshape.refine import objective, reconstruction, run
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.reconstruction import refiner_for
+
+# The same examples each time, without deadlines: what fails, fails for the change that broke it.
+settings.load_profile("ci")
 
 
 @pytest.fixture(scope="session")

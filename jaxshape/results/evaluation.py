@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, Bool, Key
 
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.dataset import hash_seed
@@ -96,9 +96,9 @@ def evaluate(
         seen = [(model, case) for model, case in observed if case is not None]
         if not seen:
             continue
-        keys = jnp.stack([key for model, _ in seen for key in _keys(model, config)])
+        keys = jnp.concatenate([case_keys(m.name, config.frames, config.seed) for m, _ in seen])
         cases = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in seen])
-        keys, filled = jax.tree.map(lambda x: _fill(x, size), (keys, cases))
+        keys, filled = jax.tree.map(lambda x: fill(x, size), (keys, cases))
         found = jax.device_get(run(keys, prior, filled.occupied, filled.occluded))
         found = {name: found[name] for name in config.methods}  # JAX has sorted the names
         cases = jax.device_get(cases)
@@ -138,12 +138,12 @@ def by_each_method(
     return run
 
 
-def _keys(model: Model, config: EvaluateConfig) -> list[PRNGKeyArray]:
+def case_keys(name: str, frames: Sequence[int], seed: int = 0) -> Key[Array, " case"]:
     """Random keys that depend on the mesh and the number of frames, not on the batch."""
-    return [jax.random.key(hash_seed(config.seed, k, *model.name.encode())) for k in config.frames]
+    return jnp.stack([jax.random.key(hash_seed(seed, k, *name.encode())) for k in frames])
 
 
-def _fill(rows: Array, size: int) -> Array:
+def fill(rows: Array, size: int) -> Array:
     """Repeat the first rows until there are `size`."""
     return rows[jnp.arange(size) % len(rows)]
 

@@ -13,22 +13,17 @@ import trimesh
 from jaxtyping import Bool, Float, Integer, UInt8
 
 from jaxshape.files import atomic_path
+from jaxshape.results.figures import BLUE, GREEN, INK, ORANGE
 
 AZIMUTH, ELEVATION = 35.0, 25.0
 
-# The palette of Okabe and Ito, whose colours the common kinds of colour blindness keep apart.
-COLORS = {
-    "measured": "#0072B2",
-    "predicted": "#E69F00",
-    "truth": "#009E73",
-    "occluded": "#B4BBC2",
-}
+COLORS = {"measured": BLUE, "predicted": ORANGE, "truth": GREEN, "occluded": "#B4BBC2"}
 
 _SUPERSAMPLING = 2  # pixels averaged along each axis, to smooth edges
 _MARGIN = 1.02  # room around the object, as a factor of its extent
 _LIGHT = np.array([-0.35, 0.8, 0.5]) / np.linalg.norm([-0.35, 0.8, 0.5])  # right, up, towards us
 _AMBIENT = 0.68
-_INK, _PALE = "#2B2F33", "#F1F3F4"
+_PALE = "#F1F3F4"
 
 
 def _rgb(color: str) -> Float[np.ndarray, " 3"]:
@@ -299,7 +294,7 @@ def overview(
         _draw_row(figure, row, top / total, height / total)
         top += _TEXT + height + note + _GAP
     if caption:
-        figure.text(0.5, 1 - top / total, caption, ha="center", va="top", fontsize=15, color=_INK)
+        figure.text(0.5, 1 - top / total, caption, ha="center", va="top", fontsize=15, color=INK)
     with atomic_path(path) as temporary:
         figure.savefig(temporary)
 
@@ -321,7 +316,7 @@ def _draw_row(figure: Any, row: Sequence[Panel], top: float, height: float) -> N
         axes.imshow(panel.image, aspect="auto", interpolation="antialiased")
         axes.axis("off")
         middle = left + width / 2
-        style = {"ha": "center", "va": "center", "color": _INK}
+        style = {"ha": "center", "va": "center", "color": INK}
         figure.text(middle, 1 - top - line / 2, panel.title, fontsize=16, weight="bold", **style)
         figure.text(middle, 1 - top - 1.5 * line - height, panel.note, fontsize=15, **style)
         left += width + gap

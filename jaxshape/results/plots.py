@@ -7,16 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxshape.files import atomic_path
 from jaxshape.refine.refiner import Distribution, Trace
+from jaxshape.results.figures import BLUE, CYCLE, GREEN, INK, ORANGE, save_figure, tidy
 from jaxshape.results.traces import Search, restarts
 
 SUFFIXES = (".png", ".svg", ".pdf")
-
-# The palette of Okabe and Ito, whose colours the common kinds of colour blindness keep apart.
-_BLUE, _ORANGE, _GREEN = "#0072B2", "#E69F00", "#009E73"
-_LINES = (_BLUE, _ORANGE, _GREEN, "#CC79A7", "#56B4E9", "#D55E00")
-_INK, _FAINT = "#2B2F33", "#E3E6E8"
 
 
 def plot_search(path: str | Path, search: Search) -> None:
@@ -48,12 +43,12 @@ def plot_search(path: str | Path, search: Search) -> None:
         for axes, panel in zip(grid.flat, panels, strict=True):
             panel(axes)
             axes.set_yscale("log")
-            _tidy(axes)
+            tidy(axes)
             for iteration in again:
-                axes.axvline(evaluations[iteration], color=_INK, linewidth=0.8, dashes=(4, 3))
+                axes.axvline(evaluations[iteration], color=INK, linewidth=0.8, dashes=(4, 3))
         for axes in grid[-1]:
             axes.set_xlabel("evaluations")
-        figure.suptitle(_heading(search, len(again)), fontsize=10, color=_INK)
+        figure.suptitle(_heading(search, len(again)), fontsize=10, color=INK)
 
     size = {1: (4.4, 3.4), 2: (5.8, 3.0), 4: (5.8, 5.0)}[len(panels)]
     _save(path, size, [search], draw)
@@ -74,7 +69,7 @@ def compare_searches(path: str | Path, searches: Sequence[Search]) -> None:
         axes.set_yscale("log")
         axes.set_xlabel("evaluations")
         axes.set_title("lowest objective so far")
-        _tidy(axes)
+        tidy(axes)
         axes.legend(frameon=False)
 
     _save(path, (5.6, 4.0), searches, draw)
@@ -98,7 +93,7 @@ def convergence(
             axes.plot(iteration, trace.mean(axis=0), color=color, linewidth=1.8, label=name)
         axes.set_xlabel("iteration")
         axes.set_ylabel(label)
-        _tidy(axes)
+        tidy(axes)
         if len(traces) > 1:
             axes.legend(frameon=False)
 
@@ -111,8 +106,8 @@ def convergence(
 def _losses(axes: Any, trace: Trace) -> None:
     lowest = float(min(trace.loss.min(), trace.best_loss.min()))
     of_iteration = _above(trace.loss, lowest)
-    axes.plot(trace.evaluations, of_iteration, color=_ORANGE, lw=0.9, label="of the iteration")
-    axes.plot(trace.evaluations, _above(trace.best_loss, lowest), color=_BLUE, lw=1.8, label="best")
+    axes.plot(trace.evaluations, of_iteration, color=ORANGE, lw=0.9, label="of the iteration")
+    axes.plot(trace.evaluations, _above(trace.best_loss, lowest), color=BLUE, lw=1.8, label="best")
     axes.set_title(f"objective above the lowest, {lowest:.4f}")
     axes.legend(frameon=False)
 
@@ -125,8 +120,8 @@ def _above(losses: Float[Array | np.ndarray, " n"], lowest: float) -> Float[np.n
 
 def _step_size(axes: Any, evaluations: Any, normal: Distribution) -> None:
     ratio = normal.axis_lengths[:, -1] / normal.axis_lengths[:, 0]
-    axes.plot(evaluations, normal.sigma, color=_GREEN, lw=1.8, label="sigma")
-    axes.plot(evaluations, ratio, color=_ORANGE, lw=1.8, label="axis ratio")
+    axes.plot(evaluations, normal.sigma, color=GREEN, lw=1.8, label="sigma")
+    axes.plot(evaluations, ratio, color=ORANGE, lw=1.8, label="axis ratio")
     axes.set_title("step size and axis ratio")
     axes.legend(frameon=False)
 
@@ -143,7 +138,7 @@ def _bundle(axes: Any, title: str, evaluations: Any, values: Any) -> None:
 
 
 def _spread(axes: Any, trace: Trace) -> None:
-    axes.plot(trace.evaluations, trace.spread, color=_GREEN, lw=1.8)
+    axes.plot(trace.evaluations, trace.spread, color=GREEN, lw=1.8)
     axes.set_title("spread of the candidates")
 
 
@@ -161,24 +156,7 @@ def _heading(search: Search, restarts: int) -> str:
 
 
 def _cycle(lines: Any) -> list[str]:
-    return [_LINES[i % len(_LINES)] for i in range(len(lines))]
-
-
-def _tidy(axes: Any) -> None:
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
-
-    axes.grid(color=_FAINT, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.margins(x=0.02)
-    if axes.get_yscale() == "log":
-        low, high = axes.get_ylim()
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        if high < 100 * low:  # too few powers of ten to tell where one is
-            narrow, wide = MaxNLocator(5, steps=[1, 2, 5, 10]), LogLocator(subs=(1, 2, 5))
-            axes.yaxis.set_major_locator(narrow if high < 10 * low else wide)
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_locator(NullLocator())
+    return [CYCLE[i % len(CYCLE)] for i in range(len(lines))]
 
 
 def _save(
@@ -196,19 +174,4 @@ def _save(
     for search in searches:
         if len(search.trace.loss) == 0:
             raise ValueError(f"The search of {search.name!r} ended before its first iteration.")
-    # Slow to import, and only pictures need it.
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    style: dict[Any, Any] = {
-        "font.size": 10,
-        "axes.titlesize": 10,
-        "legend.fontsize": 9,
-        "text.color": _INK,
-        "axes.edgecolor": _INK,
-        "svg.hashsalt": "jaxshape",  # the same file for the same search
-    }
-    with rc_context(style), atomic_path(path) as temporary:
-        figure = Figure(figsize=size, dpi=200, layout="constrained")
-        draw(figure)
-        figure.savefig(temporary)
+    save_figure(path, size, draw)

@@ -1,0 +1,35 @@
+"""Rows of a long run, kept as they come: a killed run goes on after its last row. [host]"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from jaxshape.files import atomic_path
+
+
+class Journal:
+    """The rows of one results file, by name; rows made under other settings are not its own."""
+
+    def __init__(self, path: Path, settings: dict[str, Any]):
+        self.path = path
+        self.settings: dict[str, Any] = json.loads(json.dumps(settings))  # tuples become lists
+        self.rows: dict[str, Any] = {}
+        self.seconds = 0.0
+        if path.is_file():
+            earlier = json.loads(path.read_text())
+            if earlier.get("settings") == self.settings:
+                self.rows, self.seconds = earlier["rows"], earlier["seconds"]
+
+    def add(self, rows: dict[str, Any], seconds: float) -> None:
+        """Write some rows and the seconds they took to the file, with all before them."""
+        self.rows |= rows
+        self.seconds = round(self.seconds + seconds, 1)
+        self.write({})
+
+    def write(self, findings: dict[str, Any]) -> None:
+        """Write the file anew, with what the rows say put before them."""
+        about = {"settings": self.settings, "seconds": self.seconds}
+        content = json.dumps(about | findings, indent=1)[:-2]
+        rows = ",\n".join(f"  {json.dumps(k)}: {json.dumps(v)}" for k, v in self.rows.items())
+        with atomic_path(self.path) as temporary:
+            temporary.write_text(f'{content},\n "rows": {{\n{rows}\n }}\n}}\n')

@@ -1,0 +1,201 @@
+"""Searches compared on the same chairs: what the scripts in `experiments/` have in common. [host]
+
+A `Contestant` is given a batch of cases, what was seen of chairs after some number of frames, and
+returns its scores as arrays with a row for each case; `compare` runs some on the whole `TestSet`.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+from rich.progress import track
+
+from jaxshape.data.archives import list_meshes
+from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
+from jaxshape.data.meshes import Skipped
+from jaxshape.model.weights import ShapePrior
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.reconstruction import Reconstruction, reconstruct, refiner_for
+from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
+from jaxshape.results.figures import interval
+from jaxshape.results.journal import Journal
+from jaxshape.results.metrics import bounds, iou
+
+CASES_AT_A_TIME = 64
+"""Cases searched together, unless a chair has more: the rows between two entries of the journal."""
+
+# Scores of a batch of cases, from a random key for each, the prior, and the cases themselves.
+Scores = Mapping[str, Array]
+Contestant = Callable[[Key[Array, " case"], ShapePrior, Case], Scores]
+
+
+@dataclass(frozen=True)
+class TestSet:
+    """The chairs that searches are compared on; none was trained on."""
+
+    __test__ = False  # pytest would take the name for a test
+
+    chairs: int = 288
+    """Procedural chairs, from seeds kept for tests (the paper has 288 of ShapeNet)."""
+    seats: int = 78
+    """CAD seats at most."""
+    meshes: Path = Path("cad_chairs")
+    """Folder of the CAD seats, as experiments/cad_seats.py writes it."""
+
+
+class Subject(NamedTuple):
+    """One chair of the test set."""
+
+    name: str
+    group: str
+    """`procedural` or `CAD`."""
+    item: Object
+
+
+def subjects(test: TestSet) -> list[Subject]:
+    """The chairs of a test set, mixed: a smaller set is part of a larger one.
+
+    `FileNotFoundError` where seats are asked for and there is no folder of meshes.
+    """
+    procedural = [Subject(f"chair-{TEST_SEEDS + i}", "procedural", TEST_SEEDS + i)
+                  for i in range(test.chairs)]  # fmt: skip
+    seats = list_meshes(test.meshes) if test.seats else []
+    cad = [Subject(source.name, "CAD", source) for source in sorted(seats, key=_mix)]
+    return sorted(procedural + cad[: test.seats], key=_mix)
+
+
+def _mix(subject: Any) -> int:
+    return hash_seed(0, *subject.name.encode())
+
+
+def by_method(method: str, prior: ShapePrior, config: RefineConfig) -> Contestant:
+    """The contestant that rebuilds by a method of `jaxshape.refine.methods`, or `encoder`."""
+    refiner = refiner_for(method, prior, config)
+
+    def contest(keys, prior, case):
+        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, config)
+        return shape_and_objective(found, case)
+
+    return contest
+
+
+def shape_and_objective(found: Reconstruction, case: Case) -> Scores:
+    """IoU of the decoded and of the composed shape, and the objective that was reached."""
+    return {
+        "iou": iou(found.completed, case.surface),
+        "iou_composed": iou(found.composed, case.surface),
+        "objective": found.objective,
+    }
+
+
+def measurement(keys: Key[Array, " case"], prior: ShapePrior, case: Case) -> Scores:
+    """The paper's lower and upper bound: F with what is occluded set to empty, and to full."""
+    return bounds(*case)._asdict()
+
+
+def compare(
+    contestants: Mapping[str, Contestant],
+    prior: ShapePrior,
+    test: TestSet,
+    frames: Sequence[int],
+    journal: Journal,
+) -> None:
+    """Run every contestant on every chair that has no row yet, after each number of frames.
+
+    A row is `{"group": ..., frames: {contestant: scores}}`; `seconds` are added to the scores:
+    those of the batch, compiling apart, shared out over its cases. All contestants draw the same
+    random keys, which depend on the chair and the number of frames alone.
+    """
+    missing = [one for one in subjects(test) if one.name not in journal.rows]
+    group = max(1, CASES_AT_A_TIME // len(frames))
+    size = min(group, len(missing)) * len(frames)
+    compiled: dict[str, Any] = {}
+    starts = range(0, len(missing), group)
+    for start in track(starts, description=journal.path.stem, disable=not missing):
+        began = time.perf_counter()
+        batch = list(_observed(missing[start : start + group], frames))
+        if not batch:
+            continue
+        keys = jnp.concatenate([case_keys(one.name, frames) for one, _ in batch])
+        case = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in batch])
+        keys, case = jax.tree.map(lambda x: fill(x, size), (keys, case))
+        found = {}
+        for name, contestant in contestants.items():
+            if name not in compiled:
+                compiled[name] = jax.jit(contestant).lower(keys, prior, case).compile()
+            found[name] = _timed(compiled[name], keys, prior, case)
+        rows = {
+            one.name: {"group": one.group}
+            | {
+                str(k): {name: _row(scores, i * len(frames) + j) for name, scores in found.items()}
+                for j, k in enumerate(frames)
+            }
+            for i, (one, _) in enumerate(batch)
+        }
+        journal.add(rows, time.perf_counter() - began)
+
+
+def _observed(chairs: Sequence[Subject], frames: Sequence[int]) -> Iterator[tuple[Subject, Case]]:
+    """The chairs and what is seen of them; those that cannot be used are named and left out."""
+    for chair in chairs:
+        model = load_object(chair.item)
+        case = None if isinstance(model, Skipped) else observe(model, EvaluateConfig(tuple(frames)))
+        if case is None:
+            print(f"{chair.name} is left out: {model}")
+        else:
+            yield chair, case
+
+
+def _timed(run: Callable[..., Scores], *args: Any) -> dict[str, np.ndarray]:
+    start = time.perf_counter()
+    scores = jax.block_until_ready(run(*args))
+    seconds = time.perf_counter() - start
+    arrays = {name: np.asarray(values) for name, values in scores.items()}
+    count = len(next(iter(arrays.values())))
+    return arrays | {"seconds": np.full(count, seconds / count)}
+
+
+def _row(scores: Mapping[str, np.ndarray], i: int) -> dict[str, Any]:
+    """The scores of one case, to five significant digits, as JSON has them."""
+    return {name: _rounded(values[i].tolist()) for name, values in scores.items()}
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+class Claim(NamedTuple):
+    """What the paper says, and what was found here: a row of the README's table."""
+
+    figure: str
+    """Of the paper, or `beyond`."""
+    claim: str
+    ours: str
+    """The finding, with its figures."""
+    holds: str
+    """`yes`, `no`, or what of it does."""
+
+
+def mean_interval(values: Float[np.ndarray, " n"]) -> str:
+    """The mean with its 95 % interval, as text: `+0.043 (0.040 to 0.047)`."""
+    low, high = interval(values[:, None])[:, 0]
+    return f"{values.mean():+.3f} ({low:.3f} to {high:.3f})"
+
+
+def column(journal: Journal, group: str, frames: int, contestant: str, score: str) -> np.ndarray:
+    """One score of one contestant over all chairs of a group, in the order of the rows."""
+    rows = [row for row in journal.rows.values() if row["group"] == group]
+    return np.array([row[str(frames)][contestant][score] for row in rows])
+
+
+def groups(journal: Journal) -> list[str]:
+    """The groups of chairs that have rows: procedural ones first."""
+    return sorted({row["group"] for row in journal.rows.values()}, reverse=True)
