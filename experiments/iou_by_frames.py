@@ -4,10 +4,9 @@ r"""IoU by number of frames: encoder, gradients, CMA-ES, and F alone (paper, Fig
 
 288 procedural chairs and the 78 CAD seats, each seen by the first k frames of an orbit at 30
 degrees elevation, 20 degrees apart, with true poses and no noise, as in section 4.1 of the paper.
-Every search starts from the encoder's code and has the same number of iterations: gradient descent
-in the codes themselves with the paper's step of 0.14, Adam and CMA-ES as they are by default. The
-two bounds are F with all occluded voxels set to empty and to full. Means over chairs with their
-95 % intervals by bootstrap.
+Every search starts from the encoder's code and has the same number of iterations, with the steps
+that step_size.py finds best. The two bounds are F with all occluded voxels set to empty and to
+full. Means over chairs with their 95 % intervals by bootstrap.
 
 Results: experiments/results/iou_by_frames.json, .png and .svg; chairs that are done are kept.
 Time: 50 minutes on two cores.
@@ -72,10 +71,9 @@ def run(config: Config) -> Journal:
     }
     journal = Journal(config.results / "iou_by_frames.json", settings)
     search = RefineConfig(iterations=config.iterations)
-    codes = replace(search, space="raw")
     contestants = {
         "encoder": by_method("encoder", prior, search),
-        "gradient descent": by_method("gradient", prior, codes),
+        "gradient descent": by_method("gradient", prior, search),
         "Adam": by_method("gradient:adam", prior, search),
         "CMA-ES": by_method("cma", prior, search),
         "F": measurement,

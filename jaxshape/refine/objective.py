@@ -38,20 +38,23 @@ def target(
     prior_logits: Float[Array, "*batch x y z"],
     *,
     occupied_weight: float = BALANCED_WEIGHT,
+    prior_scale: Float[Array, "*#batch 1 1 1"] | float = 1.0,
 ) -> Target:
     """The weights of Eq. 7: F where something was seen, alpha times the prior elsewhere.
 
     `occupied` is F, `occluded` is M, `prior_logits` the decoded first code, G(lambda_0).
     `occupied_weight` is 1 for the paper's objective; more keeps thin measured structures from
     drowning in free space.
-    alpha = sum(M) / sum(1 - M); it is 0 where nothing is occluded, and where everything is, the
-    sum over no voxels counts as one, so that the prior alone decides.
+    alpha = sum(M) / sum(1 - M), times `prior_scale`, which is 1 in the paper; it is 0 where nothing
+    is occluded, and where everything is, the sum over no voxels counts as one, so that the prior
+    alone decides.
     """
     axes = (-3, -2, -1)
     M = occluded.astype(prior_logits.dtype)
     F = occupied.astype(prior_logits.dtype)
     G0 = jax.nn.sigmoid(prior_logits)
     alpha = M.sum(axes, keepdims=True) / jnp.maximum((1 - M).sum(axes, keepdims=True), 1)
+    alpha = prior_scale * alpha
     return Target(
         occupied=occupied_weight * (1 - M) * F + alpha * M * G0,
         empty=(1 - M) * (1 - F) + alpha * M * (1 - G0),

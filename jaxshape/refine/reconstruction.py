@@ -38,6 +38,8 @@ class Reconstruction(NamedTuple):
     """Eq. 7, in nats per voxel, of the first and of the refined code."""
     trace: Trace | None
     """Of the search, per object and iteration; None for the encoder alone."""
+    path: Float[Array, "object iteration d"] | None
+    """The best code so far, after each iteration of the search."""
     iterations: Int[Array, " object"] | None
     """How many iterations the search took."""
     stop: Int[Array, " object"] | None
@@ -132,6 +134,7 @@ def reconstruct(
         first_objective=first_objective,
         objective=objective,
         trace=found and found.trace,
+        path=found and found.path,
         iterations=found and found.iterations,
         stop=found and found.stop,
     )
@@ -161,7 +164,7 @@ def fit_surface(
         prior.params,
         encode(prior.params, surface),
         target(surface, nothing, jnp.zeros(surface.shape)),
-        refiner_for("gradient:adam", prior, config),
+        build_refiner("gradient:adam", len(prior.code_mean), config),
         iterations,
         space=search_space(prior, config),
     )

@@ -1,6 +1,7 @@
 """The refinement loop: many objects, each with its population, in one compiled program."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +31,8 @@ class Refined(NamedTuple):
     """Its objective, in nats per voxel, with the penalty if there is one."""
     trace: Trace
     """Per object and iteration; constant once the object's search has stopped."""
+    path: Float[Array, "object iteration d"]
+    """The best code so far, after each iteration."""
     iterations: Int[Array, " object"]
     """How many the search took before it stopped."""
     stop: Int[Array, " object"]
@@ -102,13 +105,16 @@ def refine(
             return jax.vmap(move)(step_keys, states, targets, traces)
 
         states, traces = lax.cond(jnp.any(running), move_all, lambda: (states, traces))
-        return ((states, traces), steps + running), traces
+        return ((states, traces), steps + running), (traces, states.best.point)
 
     first_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
     started = jax.vmap(begin)(first_keys, codes, targets, first_losses, previous)
     started = _stop_at(target_loss, started[0]), started[1]
     steps = jnp.zeros(len(codes), jnp.int32)
-    ((states, _), steps), traces = lax.scan(iterate, (started, steps), jnp.arange(iterations))
+    ((states, _), steps), (traces, path) = lax.scan(
+        iterate, (started, steps), jnp.arange(iterations)
+    )
+    over_iterations = partial(jnp.moveaxis, source=0, destination=1)
 
     # Where the search stands at last was never evaluated: the mean of a population, or the point
     # after the last gradient step. It may be the better one.
@@ -123,7 +129,8 @@ def refine(
         code=code,
         logits=logits,
         loss=loss,
-        trace=jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), traces),
+        trace=jax.tree.map(over_iterations, traces),
+        path=jax.vmap(jax.vmap(to_code))(over_iterations(path)),
         iterations=steps,
         stop=jnp.where(states.stop == StopReason.RUNNING, StopReason.BUDGET, states.stop),
         state=states,

@@ -78,6 +78,16 @@ def test_only_measured_occupied_voxels_are_weighed_up():
     assert (balanced.occupied > printed.occupied).sum() == (occupied & ~occluded).sum()
 
 
+def test_the_prior_is_scaled_and_nothing_else():
+    occupied, occluded = random_grids(2)
+    logits = random_logits()
+    once = target(occupied, occluded, logits)
+    twice = target(occupied, occluded, logits, prior_scale=2.0)
+    factor = np.where(occluded, 2, 1)
+    np.testing.assert_allclose(twice.occupied, factor * once.occupied, rtol=1e-6)
+    np.testing.assert_allclose(twice.empty, factor * once.empty, rtol=1e-6)
+
+
 def test_nothing_or_everything_occluded_is_defined():
     occupied, (prior_logits, logits) = random_grids(), random_logits(2)
 

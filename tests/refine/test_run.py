@@ -82,6 +82,13 @@ def test_the_outcome_is_the_best_code_and_never_worse_than_the_first(refined):
     assert np.all(refined.loss <= refined.trace.best_loss[:, -1] * (1 + 1e-6))
 
 
+def test_the_path_holds_the_best_code_after_each_iteration(refined):
+    assert refined.path.shape == (OBJECTS, ITERATIONS, D)
+    for i in range(OBJECTS):
+        losses = [loss_of(code, i) for code in refined.path[i]]
+        np.testing.assert_allclose(losses, refined.trace.best_loss[i], rtol=1e-5)
+
+
 def test_the_trace_never_rises_and_counts_what_was_decoded(method, refined, counts):
     trace = refined.trace
     assert trace.best_loss.shape == (OBJECTS, ITERATIONS)

@@ -54,6 +54,7 @@ RECONSTRUCTION = Reconstruction(
     first_objective=jnp.array([0.5]),
     objective=jnp.array([0.25]),
     trace=Trace(*(jnp.array([[5.0, 4, 3]]),) * 3, jnp.array([[11, 21, 31]])),
+    path=jnp.zeros((1, 3, 10)),
     iterations=jnp.array([3]),
     stop=jnp.array([StopReason.TOLX]),
 )

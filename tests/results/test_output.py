@@ -47,6 +47,7 @@ RECONSTRUCTION = Reconstruction(
     objective=jnp.array([0.25]),
     # Stopped after three of five iterations, and constant from then on.
     trace=Trace(*(jnp.array([[5.0, 4, 3, 3, 3]]),) * 3, jnp.array([[11, 21, 31, 31, 31]])),
+    path=jnp.zeros((1, 5, 10)),
     iterations=jnp.array([3]),
     stop=jnp.array([StopReason.TOLX]),
 )
