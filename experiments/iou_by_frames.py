@@ -20,7 +20,6 @@ import numpy as np
 import tyro
 
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.process import prepare_process
 from jaxshape.refine.config import RefineConfig
 from jaxshape.results.figures import LINES, PAGE, draw_mean, interval, save_column, tidy
 from jaxshape.results.journal import Journal
@@ -197,5 +196,4 @@ def plot(journal: Journal, config: Config) -> None:
 
 
 if __name__ == "__main__":
-    prepare_process()
     main(tyro.cli(Config))

@@ -21,7 +21,7 @@ from .refine.methods import build_refiner
 from .refine.methods.evosax import evosax_strategy
 from .refine.methods.gradient import gradient
 from .refine.methods.hybrid import polished
-from .refine.objective import Target, objective, target
+from .refine.objective import Target, Weights, objective, target
 from .refine.reconstruction import (
     Reconstruction,
     compose,
@@ -66,6 +66,7 @@ __all__ = [
     "Trace",
     "TrackingConfig",
     "Trajectory",
+    "Weights",
     "bounds",
     "build_mapper",
     "build_refiner",

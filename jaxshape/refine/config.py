@@ -11,7 +11,7 @@ class RefineConfig:
     """How a shape is searched for."""
 
     objective: Literal["balanced", "paper"] = "balanced"
-    """`paper` is Eq. 7 as printed; `balanced` weighs measured occupied voxels three times."""
+    """`paper` is Eq. 7 as printed; in `balanced` measured free space counts a third."""
     iterations: int = 350
     """Steps of the search at most (paper: 350)."""
     population: int = 17

@@ -18,11 +18,23 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.chunks import in_chunks
 
-BALANCED_WEIGHT = 3.0
-"""Weight of measured occupied voxels in the `balanced` objective; the paper has 1."""
-
 CANDIDATES_AT_A_TIME = {"cpu": 8, "default": 1024}
 """Candidates decoded together: on CPU enough rows for its products, else a full device."""
+
+
+class Weights(NamedTuple):
+    """How the parts of Eq. 7 are weighed against what was measured as occupied."""
+
+    free: float = 1.0
+    """Of what was measured as free; less keeps thin structures from drowning in free space."""
+    prior: Float[Array, "*#batch 1 1 1"] | float = 1.0
+    """Of the prior where nothing was measured: a factor of alpha."""
+
+
+PAPER = Weights()
+"""Eq. 7 as printed."""
+BALANCED = Weights(free=1 / 3)
+"""The best on procedural and CAD chairs, without noise and with it (experiments/objective.py)."""
 
 
 class Target(NamedTuple):
@@ -36,28 +48,23 @@ def target(
     occupied: Bool[Array, "*batch x y z"],
     occluded: Bool[Array, "*batch x y z"],
     prior_logits: Float[Array, "*batch x y z"],
-    *,
-    occupied_weight: float = BALANCED_WEIGHT,
-    prior_scale: Float[Array, "*#batch 1 1 1"] | float = 1.0,
+    weights: Weights = BALANCED,
 ) -> Target:
     """The weights of Eq. 7: F where something was seen, alpha times the prior elsewhere.
 
     `occupied` is F, `occluded` is M, `prior_logits` the decoded first code, G(lambda_0).
-    `occupied_weight` is 1 for the paper's objective; more keeps thin measured structures from
-    drowning in free space.
-    alpha = sum(M) / sum(1 - M), times `prior_scale`, which is 1 in the paper; it is 0 where nothing
-    is occluded, and where everything is, the sum over no voxels counts as one, so that the prior
-    alone decides.
+    alpha = sum(M) / sum(1 - M), times `weights.prior`; it is 0 where nothing is occluded, and where
+    everything is, the sum over no voxels counts as one, so that the prior alone decides.
     """
     axes = (-3, -2, -1)
     M = occluded.astype(prior_logits.dtype)
     F = occupied.astype(prior_logits.dtype)
     G0 = jax.nn.sigmoid(prior_logits)
     alpha = M.sum(axes, keepdims=True) / jnp.maximum((1 - M).sum(axes, keepdims=True), 1)
-    alpha = prior_scale * alpha
+    alpha = weights.prior * alpha
     return Target(
-        occupied=occupied_weight * (1 - M) * F + alpha * M * G0,
-        empty=(1 - M) * (1 - F) + alpha * M * (1 - G0),
+        occupied=(1 - M) * F + alpha * M * G0,
+        empty=weights.free * (1 - M) * (1 - F) + alpha * M * (1 - G0),
     )
 
 

@@ -14,7 +14,7 @@ from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior
 from jaxshape.refine.config import RefineConfig
 from jaxshape.refine.methods import build_refiner
-from jaxshape.refine.objective import BALANCED_WEIGHT, cross_entropy, target
+from jaxshape.refine.objective import BALANCED, PAPER, cross_entropy, target
 from jaxshape.refine.refiner import Refiner, Trace
 from jaxshape.refine.run import Penalty, refine
 from jaxshape.refine.space import LatentSpace, raw, whitened
@@ -95,8 +95,8 @@ def reconstruct(
     """
     first_code = encode(prior.params, occupied)
     first_logits = decode(prior.params, first_code)
-    weight = BALANCED_WEIGHT if config.objective == "balanced" else 1.0
-    targets = target(occupied, occluded, first_logits, occupied_weight=weight)
+    weights = BALANCED if config.objective == "balanced" else PAPER
+    targets = target(occupied, occluded, first_logits, weights)
     first_objective = cross_entropy(first_logits, targets)
     start, start_objective = first_code, first_objective
     if earlier is not None:

@@ -77,7 +77,7 @@ def tidy(axes: Any) -> None:
 
 
 def save_figure(
-    path: str | Path, size: tuple[float, float], draw: Callable[[Any], None], *, font: float = 10
+    path: str | Path, size: tuple[float, float], draw: Callable[[Any], None], *, font: float = 10.0
 ) -> None:
     """Write a figure of a size in inches, in the format that the suffix names.
 
@@ -107,4 +107,4 @@ def save_column(
 ) -> None:
     """Write a figure for a column of a paper (or a page), as `stem`.png and `stem`.svg."""
     for suffix in (".png", ".svg"):
-        save_figure(stem.with_suffix(suffix), (width, height), draw, font=8)
+        save_figure(stem.with_suffix(suffix), (width, height), draw, font=8.0)

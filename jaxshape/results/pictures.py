@@ -164,6 +164,22 @@ def _corner_crowding(
     return np.stack(counts, axis=-1)
 
 
+def render_measurement(
+    occupied: Bool[np.ndarray, "x y z"],
+    occluded: Bool[np.ndarray, "x y z"],
+    *,
+    size: int = 256,
+    azimuth: float = AZIMUTH,
+    elevation: float = ELEVATION,
+) -> UInt8[np.ndarray, "size size 3"]:
+    """Draw F in colour, and M as a fog through which the F behind it shows."""
+    colors = (COLORS["measured"], COLORS["occluded"])
+    view = {"size": size, "azimuth": azimuth, "elevation": elevation}
+    solid = render_voxels(occupied, colors, **view)
+    fog = render_voxels(np.where(occupied, 1, 2 * occluded), colors, **view)
+    return np.rint(0.5 * solid + 0.5 * fog).astype(np.uint8)
+
+
 def draw_voxels(ax: Any, labels: Any, colors: Sequence[str] = (COLORS["predicted"],)) -> None:
     """Show `render_voxels` of a grid on a matplotlib axes."""
     ax.imshow(render_voxels(labels, colors, size=512))
@@ -237,10 +253,7 @@ def measurement_panel(
     note: str = "",
 ) -> Panel:
     """Picture F in colour, and M as a fog through which the F behind it shows."""
-    colors = (COLORS["measured"], COLORS["occluded"])
-    solid = render_voxels(occupied, colors, size=_CELL)
-    fog = render_voxels(np.where(occupied, 1, 2 * occluded), colors, size=_CELL)
-    return Panel(title, np.rint(0.5 * solid + 0.5 * fog).astype(np.uint8), note)
+    return Panel(title, render_measurement(occupied, occluded, size=_CELL), note)
 
 
 def mesh_panel(title: str, mesh: trimesh.Trimesh, color: str, note: str = "") -> Panel:

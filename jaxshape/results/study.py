@@ -5,7 +5,7 @@ returns its scores as arrays with a row for each case; `compare` runs some on th
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
-from rich.progress import track
+from rich.progress import Progress, TimeElapsedColumn
 
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
@@ -102,50 +102,62 @@ def measurement(keys: Key[Array, " case"], prior: ShapePrior, case: Case) -> Sco
 def compare(
     contestants: Mapping[str, Contestant],
     prior: ShapePrior,
-    test: TestSet,
+    test: TestSet | Sequence[Subject],
     frames: Sequence[int],
     journal: Journal,
+    *,
+    noise: bool = False,
+    at_a_time: int = CASES_AT_A_TIME,
 ) -> None:
-    """Run every contestant on every chair that has no row yet, after each number of frames.
+    """Run every contestant on every chair, after each number of frames, unless its row is there.
 
     A row is `{"group": ..., frames: {contestant: scores}}`; `seconds` are added to the scores:
     those of the batch, compiling apart, shared out over its cases. All contestants draw the same
-    random keys, which depend on the chair and the number of frames alone.
+    random keys, which depend on the chair and the number of frames alone. `noise` adds the faults
+    of a real depth sensor. Fewer cases `at_a_time` lose less of a long search when it is killed.
     """
-    missing = [one for one in subjects(test) if one.name not in journal.rows]
-    group = max(1, CASES_AT_A_TIME // len(frames))
+    chairs = subjects(test) if isinstance(test, TestSet) else test
+    config = EvaluateConfig(tuple(frames), noise=noise)
+    missing = [one for one in chairs if _left(contestants, [one], journal)]
+    searches = sum(len(_left(contestants, [one], journal)) for one in missing)
+    group = max(1, at_a_time // len(frames))
     size = min(group, len(missing)) * len(frames)
     compiled: dict[str, Any] = {}
-    starts = range(0, len(missing), group)
-    for start in track(starts, description=journal.path.stem, disable=not missing):
-        began = time.perf_counter()
-        batch = list(_observed(missing[start : start + group], frames))
-        if not batch:
-            continue
-        keys = jnp.concatenate([case_keys(one.name, frames) for one, _ in batch])
-        case = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in batch])
-        keys, case = jax.tree.map(lambda x: fill(x, size), (keys, case))
-        found = {}
-        for name, contestant in contestants.items():
-            if name not in compiled:
-                compiled[name] = jax.jit(contestant).lower(keys, prior, case).compile()
-            found[name] = _timed(compiled[name], keys, prior, case)
-        rows = {
-            one.name: {"group": one.group}
-            | {
-                str(k): {name: _row(scores, i * len(frames) + j) for name, scores in found.items()}
-                for j, k in enumerate(frames)
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as bar:
+        task = bar.add_task(journal.path.stem, total=searches)
+        for start in range(0, len(missing), group):
+            began = time.perf_counter()
+            batch = list(_observed(missing[start : start + group], config))
+            if not batch:
+                continue
+            left = _left(contestants, [one for one, _ in batch], journal)
+            keys = jnp.concatenate([case_keys(one.name, frames) for one, _ in batch])
+            case = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in batch])
+            keys, case = jax.tree.map(lambda x: fill(x, size), (keys, case))
+            found = {}
+            for name in left:
+                if name not in compiled:
+                    compiled[name] = jax.jit(contestants[name]).lower(keys, prior, case).compile()
+                found[name] = _timed(compiled[name], keys, prior, case)
+                bar.advance(task, len(batch))
+            rows = {
+                one.name: _row(one, found, frames, i, journal) for i, (one, _) in enumerate(batch)
             }
-            for i, (one, _) in enumerate(batch)
-        }
-        journal.add(rows, time.perf_counter() - began)
+            journal.add(rows, time.perf_counter() - began)
 
 
-def _observed(chairs: Sequence[Subject], frames: Sequence[int]) -> Iterator[tuple[Subject, Case]]:
+def _left(names: Iterable[str], chairs: Sequence[Subject], journal: Journal) -> list[str]:
+    """The contestants that some of the chairs have not met."""
+    rows = [journal.rows.get(one.name, {}) for one in chairs]
+    met = [{name for k in row if k != "group" for name in row[k]} for row in rows]
+    return [name for name in names if not all(name in one for one in met)]
+
+
+def _observed(chairs: Sequence[Subject], config: EvaluateConfig) -> Iterator[tuple[Subject, Case]]:
     """The chairs and what is seen of them; those that cannot be used are named and left out."""
     for chair in chairs:
         model = load_object(chair.item)
-        case = None if isinstance(model, Skipped) else observe(model, EvaluateConfig(tuple(frames)))
+        case = None if isinstance(model, Skipped) else observe(model, config)
         if case is None:
             print(f"{chair.name} is left out: {model}")
         else:
@@ -161,12 +173,21 @@ def _timed(run: Callable[..., Scores], *args: Any) -> dict[str, np.ndarray]:
     return arrays | {"seconds": np.full(count, seconds / count)}
 
 
-def _row(scores: Mapping[str, np.ndarray], i: int) -> dict[str, Any]:
-    """The scores of one case, to five significant digits, as JSON has them."""
-    return {name: _rounded(values[i].tolist()) for name, values in scores.items()}
+def _row(
+    chair: Subject, found: Mapping[str, Any], frames: Sequence[int], place: int, journal: Journal
+) -> dict[str, Any]:
+    """The row of one chair, which has this place in the batch, with what it had before."""
+    row = journal.rows.get(chair.name, {"group": chair.group})
+    for i, k in enumerate(frames, start=place * len(frames)):
+        row[str(k)] = row.get(str(k), {}) | {
+            name: {score: _rounded(values[i].tolist()) for score, values in scores.items()}
+            for name, scores in found.items()
+        }
+    return row
 
 
 def _rounded(value: Any) -> Any:
+    """To five significant digits."""
     if isinstance(value, list):
         return [_rounded(v) for v in value]
     return float(f"{value:.5g}") if isinstance(value, float) else value

@@ -13,7 +13,15 @@ from hypothesis.extra.numpy import arrays
 
 from jaxshape.model.autoencoder import decode
 from jaxshape.refine import objective as module
-from jaxshape.refine.objective import Target, cross_entropy, objective, target
+from jaxshape.refine.objective import (
+    BALANCED,
+    PAPER,
+    Target,
+    Weights,
+    cross_entropy,
+    objective,
+    target,
+)
 
 SHAPE = (4, 3, 5)
 rng = np.random.default_rng(0)
@@ -55,9 +63,7 @@ logits_of_a_grid = arrays(np.float32, SHAPE, elements=st.floats(-9, 9, width=32)
 @given(booleans, booleans, logits_of_a_grid, logits_of_a_grid)
 def test_it_is_the_equation_as_printed(occupied, occluded, prior_logits, logits):
     occluded[0, 0, 0] = False  # else the printed alpha is infinite
-    weights = target(
-        jnp.asarray(occupied), jnp.asarray(occluded), jnp.asarray(prior_logits), occupied_weight=1.0
-    )
+    weights = target(jnp.asarray(occupied), jnp.asarray(occluded), jnp.asarray(prior_logits), PAPER)
     ours = cross_entropy(jnp.asarray(logits), weights)
     expected = printed_equation(
         occupied.astype(int), occluded.astype(int), sigmoid(logits), sigmoid(prior_logits)
@@ -67,22 +73,22 @@ def test_it_is_the_equation_as_printed(occupied, occluded, prior_logits, logits)
     np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=rounding)
 
 
-def test_only_measured_occupied_voxels_are_weighed_up():
+def test_only_measured_free_voxels_are_weighed_down():
     occupied, occluded = random_grids(2)
     logits = random_logits()
-    printed = target(occupied, occluded, logits, occupied_weight=1.0)
+    printed = target(occupied, occluded, logits, PAPER)
     balanced = target(occupied, occluded, logits)
-    np.testing.assert_array_equal(printed.empty, balanced.empty)
-    expected = np.where(occupied & ~occluded, 3 * printed.occupied, printed.occupied)
-    np.testing.assert_allclose(balanced.occupied, expected, rtol=1e-6)
-    assert (balanced.occupied > printed.occupied).sum() == (occupied & ~occluded).sum()
+    np.testing.assert_array_equal(printed.occupied, balanced.occupied)
+    expected = np.where(~occupied & ~occluded, printed.empty / 3, printed.empty)
+    np.testing.assert_allclose(balanced.empty, expected, rtol=1e-6)
+    assert (balanced.empty < printed.empty).sum() == (~occupied & ~occluded).sum() > 0
 
 
 def test_the_prior_is_scaled_and_nothing_else():
     occupied, occluded = random_grids(2)
     logits = random_logits()
-    once = target(occupied, occluded, logits)
-    twice = target(occupied, occluded, logits, prior_scale=2.0)
+    once = target(occupied, occluded, logits, PAPER)
+    twice = target(occupied, occluded, logits, Weights(prior=2.0))
     factor = np.where(occluded, 2, 1)
     np.testing.assert_allclose(twice.occupied, factor * once.occupied, rtol=1e-6)
     np.testing.assert_allclose(twice.empty, factor * once.empty, rtol=1e-6)
@@ -91,12 +97,12 @@ def test_the_prior_is_scaled_and_nothing_else():
 def test_nothing_or_everything_occluded_is_defined():
     occupied, (prior_logits, logits) = random_grids(), random_logits(2)
 
-    none = target(occupied, jnp.zeros(SHAPE, bool), prior_logits, occupied_weight=1.0)
+    none = target(occupied, jnp.zeros(SHAPE, bool), prior_logits, PAPER)
     np.testing.assert_array_equal(none.occupied, occupied)
     np.testing.assert_array_equal(none.empty, ~occupied)
     assert np.isfinite(cross_entropy(logits, none))
 
-    everything = target(occupied, jnp.ones(SHAPE, bool), prior_logits, occupied_weight=1.0)
+    everything = target(occupied, jnp.ones(SHAPE, bool), prior_logits, PAPER)
     count = np.prod(SHAPE)
     np.testing.assert_allclose(everything.occupied, count * sigmoid(prior_logits), rtol=1e-5)
     assert np.isfinite(cross_entropy(logits, everything))
@@ -131,12 +137,12 @@ def test_voxels_without_weight_have_no_say():
     assert np.all(slope[..., :2] == 0) and np.any(slope[..., 2:] != 0)
 
 
-@pytest.mark.parametrize("occupied_weight", [1.0, 3.0])
-def test_its_minimum_is_the_measurement_where_observed_and_the_prior_elsewhere(occupied_weight):
+@pytest.mark.parametrize("weights", [PAPER, BALANCED])
+def test_its_minimum_is_the_measurement_where_observed_and_the_prior_elsewhere(weights):
     """The slope over logits is zero at the prior, and points to the measurement at any logit."""
     occupied, occluded = random_grids(2)
     prior_logits, logits = random_logits(2)
-    weights = target(occupied, occluded, prior_logits, occupied_weight=occupied_weight)
+    weights = target(occupied, occluded, prior_logits, weights)
     slope_at = jax.grad(cross_entropy)
 
     np.testing.assert_allclose(slope_at(prior_logits, weights)[occluded], 0, atol=1e-7)

@@ -1,0 +1,77 @@
+r"""The README's table of the paper's claims, written from the results files and nothing else.
+
+    python experiments/paper_table.py
+
+Every script of `SCRIPTS` leaves its claims, with the figures found here, in its results file. This
+one puts them into README.md, between the two comments that name it. `--check` only tells whether
+the README says what the files say.
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+ROOT = Path(__file__).parents[1]
+BEGIN, END = "<!-- paper_table.py writes this -->\n", "<!-- until here -->\n"
+SCRIPTS = (
+    "convergence",
+    "step_size",
+    "iou_by_frames",
+    "voluminous",
+    "gallery",
+    "gradient_failures",
+    "real_chair",
+    "equal_budget",
+    "objective",
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the table."""
+
+    results: Path = ROOT / "experiments" / "results"
+    readme: Path = ROOT / "README.md"
+    check: bool = False
+    """Change nothing; exit with 1 where the README says something else than the files."""
+
+
+def main(config: Config) -> None:
+    text = config.readme.read_text()
+    if BEGIN not in text or END not in text:
+        sys.exit(f"{config.readme} has no lines {BEGIN.strip()!r} and {END.strip()!r} to fill.")
+    before, rest = text.split(BEGIN)
+    _, after = rest.split(END)
+    written = before + BEGIN + table(config.results) + END + after
+    if config.check:
+        sys.exit(written != text and "The README's table is not that of the results files.")
+    config.readme.write_text(written)
+
+
+def table(results: Path) -> str:
+    """A row for each claim: what the paper says, what was found, by which command, in what time."""
+    lines = [
+        "| figure | the paper's claim, or ours | holds? | found here | command, time |",
+        "|---|---|---|---|---|",
+    ]
+    for name in SCRIPTS:
+        path = results / f"{name}.json"
+        if path.is_file():
+            found = json.loads(path.read_text())
+            lines += [_row(name, found, claim) for claim in found["claims"]]
+    return "\n".join(lines) + "\n"
+
+
+def _row(name: str, found: dict[str, Any], claim: dict[str, str]) -> str:
+    minutes = max(1, round(found["seconds"] / 60))
+    command = f"[`{name}`](experiments/{name}.py), {minutes} min"
+    cells = (claim["figure"], claim["claim"], claim["holds"], claim["ours"], command)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,46 @@
+"""Every script of the paper runs on two chairs, writes its results, and has nothing left to do."""
+
+import importlib.util
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from jaxshape.refine import reconstruction
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+SCRIPTS = ["iou_by_frames", "objective"]
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_smoke(name, linear_prior, tmp_path, monkeypatch):
+    script = load(name)
+    monkeypatch.setattr(script, "load_prior", lambda: linear_prior)
+    for network in ("encode", "decode"):
+        if hasattr(script, network):
+            monkeypatch.setattr(script, network, getattr(reconstruction, network))
+    config = replace(script.Config(), smoke=True, results=tmp_path)
+    script.main(config)
+    content = json.loads((tmp_path / f"{name}.json").read_text())
+    assert content["rows"] and content["seconds"] > 0
+    for claim in content["claims"]:
+        assert set(claim) == {"figure", "claim", "ours", "holds"} and all(claim.values())
+        assert "nan" not in claim["ours"]
+    with Image.open(tmp_path / f"{name}.png") as image:
+        assert (
+            image.size[0] >= 700 and len(set(image.convert("RGB").resize((50, 50)).getdata())) > 2
+        )
+    assert "<svg" in (tmp_path / f"{name}.svg").read_text()
+
+    before = (tmp_path / f"{name}.json").read_text()
+    script.main(config)
+    assert (tmp_path / f"{name}.json").read_text() == before  # nothing was left to do

@@ -1,0 +1,35 @@
+"""A journal gives back its rows, under the same settings only, whatever killed the run."""
+
+import json
+
+from jaxshape.results.journal import Journal
+
+SETTINGS = {"frames": (1, 4), "iterations": 60}
+
+
+def test_rows_are_found_again_under_the_same_settings_only(tmp_path):
+    path = tmp_path / "results" / "study.json"
+    first = Journal(path, SETTINGS)
+    assert first.rows == {} and first.seconds == 0
+    first.add({"a": {"iou": 0.5}}, 2.0)
+    first.add({"b": {"iou": 0.25}}, 1.5)
+
+    again = Journal(path, SETTINGS)
+    assert again.rows == {"a": {"iou": 0.5}, "b": {"iou": 0.25}} and again.seconds == 3.5
+    assert Journal(path, SETTINGS | {"iterations": 61}).rows == {}
+
+
+def test_findings_stand_before_the_rows_and_do_not_cost_them(tmp_path):
+    journal = Journal(tmp_path / "study.json", SETTINGS)
+    journal.add({"ä": {"curve": [1, 2]}, "b": {}}, 1.0)
+    journal.write({"claims": ["x"]})
+    content = json.loads(journal.path.read_text())
+    assert list(content) == ["settings", "seconds", "claims", "rows"]
+    assert content["claims"] == ["x"] and content["settings"]["frames"] == [1, 4]
+    assert Journal(journal.path, SETTINGS).rows == journal.rows
+    assert sum('"curve"' in line for line in journal.path.read_text().splitlines()) == 1
+
+
+def test_a_journal_without_rows_can_be_read(tmp_path):
+    Journal(tmp_path / "study.json", SETTINGS).write({})
+    assert Journal(tmp_path / "study.json", SETTINGS).rows == {}
