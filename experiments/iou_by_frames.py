@@ -21,7 +21,7 @@ import tyro
 
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.refine.config import RefineConfig
-from jaxshape.results.figures import LINES, PAGE, draw_mean, interval, save_column, tidy
+from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.study import (
     Claim,
@@ -31,6 +31,7 @@ from jaxshape.results.study import (
     compare,
     groups,
     mean_interval,
+    mean_low_high,
     measurement,
 )
 
@@ -43,7 +44,7 @@ class Config:
     """Settings of the experiment."""
 
     test: TestSet = TestSet()
-    frames: tuple[int, ...] = (1, 2, 4, 8, 18)
+    frames: tuple[int, ...] = (1, 4, 8, 18)
     """Numbers of frames that are fused."""
     iterations: int = 60
     """Of every search (paper: 350)."""
@@ -92,9 +93,7 @@ def summary(journal: Journal, config: Config) -> dict[str, Any]:
     return {
         group: {
             name: {
-                str(k): [
-                    round(float(x), 4) for x in (values.mean(), *interval(values[:, None])[:, 0])
-                ]
+                str(k): mean_low_high(values)
                 for k, values in zip(config.frames, curves, strict=True)
             }
             for name, curves in _curves(journal, config, group).items()

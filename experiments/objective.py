@@ -45,6 +45,7 @@ from jaxshape.results.study import (
     compare,
     groups,
     mean_interval,
+    mean_low_high,
 )
 
 RESULTS = Path(__file__).parent / "results"
@@ -187,10 +188,7 @@ def summary(journal: Journal, config: Config) -> dict[str, Any]:
 
     def gains(name: str, k: int) -> dict[str, list[float]]:
         each = {score: gain(journal, k, name, score) for score in ("iou", "iou_composed")}
-        return {
-            score: [round(float(x), 4) for x in (v.mean(), *interval(v[:, None])[:, 0])]
-            for score, v in each.items()
-        }
+        return {score: mean_low_high(v) for score, v in each.items()}
 
     return {
         name: {str(k): gains(name, k) for k in config.frames} for name in _names(journal, config)
@@ -275,7 +273,7 @@ def plot(journals: dict[str, Journal], config: Config) -> None:
                 tidy(axes)
         for axes in panels[1]:
             axes.set_xlabel("IoU over the encoder's")
-        panels[0, 1].legend(frameon=False, loc="lower right")
+        panels[0, 0].legend(frameon=False, loc=(0.01, 0.3))
 
     count = sum(len(one) for one in names.values())
     save_column(config.results / "objective", draw, height=0.19 * count + 1.4, width=PAGE)

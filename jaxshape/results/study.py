@@ -205,10 +205,15 @@ class Claim(NamedTuple):
     """`yes`, `no`, or what of it does."""
 
 
+def mean_low_high(values: Float[np.ndarray, " n"]) -> list[float]:
+    """The mean and the ends of its 95 % interval, as JSON has them."""
+    return [_rounded(float(x)) for x in (values.mean(), *interval(values[:, None])[:, 0])]
+
+
 def mean_interval(values: Float[np.ndarray, " n"]) -> str:
     """The mean with its 95 % interval, as text: `+0.043 (0.040 to 0.047)`."""
-    low, high = interval(values[:, None])[:, 0]
-    return f"{values.mean():+.3f} ({low:.3f} to {high:.3f})"
+    mean, low, high = mean_low_high(values)
+    return f"{mean:+.3f} ({low:.3f} to {high:.3f})"
 
 
 def column(journal: Journal, group: str, frames: int, contestant: str, score: str) -> np.ndarray:
