@@ -35,7 +35,7 @@ from jaxshape.results.figures import BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, 
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
 from jaxshape.results.pictures import render_measurement, render_voxels
-from jaxshape.results.study import Claim, Subject, TestSet, subjects
+from jaxshape.results.study import TUNED, Claim, Subject, TestSet, subjects
 
 RESULTS = Path(__file__).parent / "results"
 CREATORS = Path(__file__).with_name("cad_seats.json")
@@ -105,7 +105,7 @@ def run(config: Config) -> tuple[Journal, list[Shown]]:
         return journal, []
     journal.rows, journal.seconds = {}, 0.0
     began = time.perf_counter()
-    search = RefineConfig(iterations=config.iterations)
+    search = replace(TUNED["CMA-ES"][1], iterations=config.iterations)
     shown = []
     for group, chairs in _by_group(config.test).items():
         seen = rebuild(chairs, (config.choose_at,), prior, search)

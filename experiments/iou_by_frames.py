@@ -4,7 +4,7 @@ r"""IoU by number of frames: encoder, gradients, CMA-ES, and F alone (paper, Fig
 
 288 procedural chairs and the 78 CAD seats, each seen by the first k frames of an orbit at 30
 degrees elevation, 20 degrees apart, with true poses and no noise, as in section 4.1 of the paper.
-Every search starts from the encoder's code and has the same number of iterations, with the steps
+Every search starts from the encoder's code and has the same number of iterations, with the values
 that step_size.py finds best. The two bounds are F with all occluded voxels set to empty and to
 full. Means over chairs with their 95 % intervals by bootstrap.
 
@@ -20,19 +20,18 @@ import numpy as np
 import tyro
 
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.refine.config import RefineConfig
 from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.study import (
     Claim,
     TestSet,
-    by_method,
     column,
     compare,
     groups,
     mean_interval,
     mean_low_high,
     measurement,
+    tuned,
 )
 
 RESULTS = Path(__file__).parent / "results"
@@ -70,14 +69,7 @@ def run(config: Config) -> Journal:
         "weights": fingerprint(prior),
     }
     journal = Journal(config.results / "iou_by_frames.json", settings)
-    search = RefineConfig(iterations=config.iterations)
-    contestants = {
-        "encoder": by_method("encoder", prior, search),
-        "gradient descent": by_method("gradient", prior, search),
-        "Adam": by_method("gradient:adam", prior, search),
-        "CMA-ES": by_method("cma", prior, search),
-        "F": measurement,
-    }
+    contestants = tuned(prior, config.iterations) | {"F": measurement}
     compare(contestants, prior, config.test, config.frames, journal)
     journal.write(
         {

@@ -33,17 +33,16 @@ from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped, sample_surface
 from jaxshape.geometry.grid import fit_box
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.refine.config import RefineConfig
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds
 from jaxshape.results.study import (
+    TUNED,
     Claim,
     Scores,
     Subject,
     TestSet,
-    by_method,
     column,
     compare,
     groups,
@@ -51,17 +50,13 @@ from jaxshape.results.study import (
     mean_low_high,
     measurement,
     subjects,
+    tuned,
 )
 
 RESULTS = Path(__file__).parent / "results"
 CHAIRS_AT_A_TIME = 13
 """The 25 voluminous chairs make two batches."""
-METHODS = {
-    "encoder": "encoder",
-    "gradient descent": "gradient",
-    "Adam": "gradient:adam",
-    "CMA-ES": "cma",
-}
+METHODS = ("encoder", *TUNED)
 
 
 @dataclass(frozen=True)
@@ -99,8 +94,7 @@ def run(config: Config) -> Journal:
         "weights": fingerprint(prior),
     }
     journal = Journal(config.results / "voluminous.json", settings)
-    search = RefineConfig(iterations=config.iterations)
-    contestants = {name: by_method(method, prior, search) for name, method in METHODS.items()}
+    contestants = tuned(prior, config.iterations)
     chairs = list(voluminous(config.test, config.enclosed))
     take_over(journal, chairs, config, fingerprint(prior))
     contestants["F"] = measured

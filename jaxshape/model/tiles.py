@@ -54,10 +54,21 @@ def transform_kernel(
     """For each pair of points, the matrix from a voxel and its neighbours along z to its phases."""
     fine, coarse = kernel.shape[-2:]
     # Along z first, which takes 6/5 of the memory; x and y last, which take 12/5 each.
-    kernel = jnp.einsum("rsm,klmfc->klscrf", NEIGHBOURS, kernel.astype(jnp.float32))
-    kernel = jnp.einsum("vql,klscrf->kvscqrf", G, kernel)
-    matrices = jnp.einsum("upk,kvscqrf->uvscpqrf", G, kernel)
+    along_z = _along(NEIGHBOURS, kernel.astype(jnp.float32), axis=2)  # [r, s, k, l, f, c]
+    along_yz = _along(G, along_z, axis=3)  # [v, q, r, s, k, f, c]
+    matrices = _along(G, along_yz, axis=4)  # [u, p, v, q, r, s, f, c]
+    matrices = matrices.transpose(0, 2, 5, 7, 1, 3, 4, 6)
     return matrices.reshape(POINTS**2, 3 * coarse, 8 * fine)
+
+
+def _along(matrix: Float[np.ndarray, "*new 5"], kernel: Array, axis: int) -> Array:
+    """A small constant matrix times one axis of a kernel, whose new axes come first.
+
+    Written out: arrays that a program holds as constants cannot be batched with it.
+    """
+    taps = [jax.lax.index_in_dim(kernel, i, axis, keepdims=False) for i in range(5)]
+    rows = _combine(matrix.reshape(-1, 5), taps, axis=0)
+    return rows.reshape(*matrix.shape[:-1], *taps[0].shape)
 
 
 def upsample_tiles(
@@ -84,8 +95,9 @@ def upsample_tiles(
 def _combine(matrix: np.ndarray, terms: Sequence[Array], axis: int) -> Array:
     """A small constant matrix times a list of arrays, written out so that it fuses."""
     rows = [[a if c == 1 else c * a for c, a in zip(row, terms, strict=True) if c]
-            for row in matrix]  # fmt: skip
-    return jnp.stack([reduce(jnp.add, row) for row in rows], axis)
+            for row in matrix.tolist()]  # fmt: skip
+    nothing = jnp.zeros_like(terms[0])
+    return jnp.stack([reduce(jnp.add, row) if row else nothing for row in rows], axis)
 
 
 def downsample_tiles(

@@ -6,7 +6,7 @@ returns its scores as arrays with a row for each case; `compare` runs some on th
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,13 @@ from jaxshape.results.metrics import bounds, iou
 
 CASES_AT_A_TIME = 64
 """Cases searched together, unless a chair has more: the rows between two entries of the journal."""
+
+TUNED: dict[str, tuple[str, RefineConfig]] = {
+    "gradient descent": ("gradient", RefineConfig(space="raw", step_size=40.0)),
+    "Adam": ("gradient:adam", RefineConfig()),
+    "CMA-ES": ("cma", RefineConfig(space="raw", sigma0=0.14)),
+}
+"""The paper's searches and Adam, with the values that experiments/step_size.py finds best."""
 
 # Scores of a batch of cases, from a random key for each, the prior, and the cases themselves.
 Scores = Mapping[str, Array]
@@ -83,6 +90,15 @@ def by_method(method: str, prior: ShapePrior, config: RefineConfig) -> Contestan
         return shape_and_objective(found, case)
 
     return contest
+
+
+def tuned(prior: ShapePrior, iterations: int) -> dict[str, Contestant]:
+    """The encoder and the `TUNED` searches, all with the same number of iterations."""
+    searches = {"encoder": ("encoder", RefineConfig())} | TUNED
+    return {
+        name: by_method(method, prior, replace(config, iterations=iterations))
+        for name, (method, config) in searches.items()
+    }
 
 
 def shape_and_objective(found: Reconstruction, case: Case) -> Scores:

@@ -11,7 +11,16 @@ from PIL import Image
 from jaxshape.refine import reconstruction
 
 FOLDER = Path(__file__).parents[2] / "experiments"
-SCRIPTS = ["iou_by_frames", "objective"]
+SCRIPTS = [
+    "convergence",
+    "step_size",
+    "iou_by_frames",
+    "voluminous",
+    "gallery",
+    "gradient_failures",
+    "equal_budget",
+    "objective",
+]
 
 
 def load(name):

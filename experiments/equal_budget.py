@@ -1,0 +1,466 @@
+r"""Searches at equal cost, and whether a lower objective is a better shape (not in the paper).
+
+    python experiments/equal_budget.py --test.meshes cad_chairs/
+
+Every search starts from the encoder's code and may spend the same number of decoder calls. A
+candidate is one call; a gradient, a pass forward and one back, is measured to take as long as three
+and counts as three, and so does each evaluation of a line search, which asks for gradients too.
+IoU and objective are those of the best code found within a number of calls. Seconds are those of a
+batch of eight chairs, shared out evenly over chairs and calls. IPOP stands for BIPOP as well: up to
+its first restart either is CMA-ES.
+
+Steps and sigma0 are those that step_size.py finds best (the hybrids' CMA-ES alike).
+
+Chairs are seen by 4 frames: as iou_by_frames.py sees them, 16 procedural ones and 16 CAD seats.
+
+Results: experiments/results/equal_budget.json, .png and .svg; chairs that are done are kept.
+Time: 16 minutes on two cores.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Array, Float, Int
+from scipy.stats import spearmanr
+
+from jaxshape.model.autoencoder import decode
+from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.methods import build_refiner
+from jaxshape.refine.methods.hybrid import POLISH, polished
+from jaxshape.refine.reconstruction import reconstruct
+from jaxshape.refine.refiner import Refiner, StopReason
+from jaxshape.results.figures import (
+    BLUE,
+    GREY,
+    INK,
+    LINES,
+    PAGE,
+    PINK,
+    RED,
+    SKY,
+    interval,
+    save_column,
+    tidy,
+)
+from jaxshape.results.journal import Journal
+from jaxshape.results.metrics import iou
+from jaxshape.results.study import (
+    TUNED,
+    Claim,
+    Contestant,
+    TestSet,
+    column,
+    compare,
+    groups,
+    mean_interval,
+)
+
+RESULTS = Path(__file__).parent / "results"
+
+GRADIENT = 3
+"""Decoder calls that a gradient counts as: 3.75 ms where a candidate takes 1.25 ms."""
+
+DRAWN: dict[str, dict[str, Any]] = {
+    "CMA-ES": LINES["CMA-ES"],
+    "CMA-ES, 64": {"color": SKY, "dashes": ()},
+    "CMA-ES, 256": {"color": SKY, "dashes": (2, 1)},
+    "IPOP": {"color": BLUE, "dashes": (1, 1)},
+    "separable": {"color": PINK, "dashes": ()},
+    "hybrid, L-BFGS": {"color": RED, "dashes": ()},
+    "hybrid, Adam": {"color": RED, "dashes": (2, 1)},
+    "gradient descent": LINES["gradient descent"],
+    "Adam": LINES["Adam"],
+    "L-BFGS": {"color": INK, "dashes": (3, 1)},
+}
+GRADIENTS = ("gradient descent", "Adam", "L-BFGS")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the experiment."""
+
+    test: TestSet = TestSet(chairs=16, seats=16)
+    frames: int = 4
+    budgets: tuple[int, ...] = (32, 64, 128, 256, 512, 768, 1024, 1536, 2048)
+    """Decoder calls after which shapes are scored; the last is what every search may spend."""
+    searches: tuple[str, ...] = tuple(DRAWN)
+    """Those to compare, CMA-ES among them."""
+    results: Path = RESULTS
+    smoke: bool = False
+    """Two procedural chairs and few calls: does it run?"""
+
+
+def main(config: Config) -> None:
+    if config.smoke:
+        test = replace(config.test, chairs=2, seats=0)
+        few = ("CMA-ES", "separable", "gradient descent", "Adam")
+        config = replace(config, test=test, budgets=(17, 34), searches=few)
+    journal = run(config)
+    plot(journal, config)
+
+
+def run(config: Config) -> Journal:
+    """Give every search its budget on every chair, and write what was found."""
+    prior = load_prior()
+    settings = {
+        "frames": config.frames,
+        "budgets": config.budgets,
+        "gradient": GRADIENT,
+        "weights": fingerprint(prior),
+    }
+    journal = Journal(config.results / "equal_budget.json", settings)
+    contestants = {
+        name: contestant(search, config.budgets)
+        for name, search in searches(prior, config.budgets[-1]).items()
+        if name in config.searches
+    }
+    compare(contestants, prior, config.test, (config.frames,), journal, at_a_time=8)
+    journal.write(
+        {
+            "claims": [claim._asdict() for claim in claims(journal, config)],
+            "summary": summary(journal, config),
+        }
+    )
+    return journal
+
+
+# ------------------------------------------------------------------ searches with a budget
+
+
+class Search(NamedTuple):
+    """A refiner, and how its evaluations count."""
+
+    refiner: Refiner
+    iterations: int
+    """As many as the budget can pay for."""
+    candidates: int
+    """Evaluations at its beginning that need no gradient."""
+    space: Literal["whitened", "raw"]
+
+    def calls(self, evaluations: Int[Array, "..."]) -> Int[Array, "..."]:
+        """Decoder calls spent, the start apart, which is the encoder's."""
+        gradients = jnp.maximum(evaluations - 1 - self.candidates, 0)
+        return evaluations - 1 + (GRADIENT - 1) * gradients
+
+
+def searches(prior: ShapePrior, budget: int) -> dict[str, Search]:
+    """All that are compared, each with `budget` decoder calls."""
+
+    def built(method: str, **settings: Any) -> Refiner:
+        return build_refiner(method, len(prior.code_mean), RefineConfig(**settings))
+
+    def population(size: int, method: str = "cma") -> Search:
+        iterations = max(1, budget // size)
+        refiner = built(method, population=size, sigma0=TUNED["CMA-ES"][1].sigma0)
+        return Search(refiner, iterations, size * iterations, "raw")
+
+    def descent(method: str, step_size: float | None = None, space: Any = "whitened") -> Search:
+        refiner = built(method, tolerance=0.0, step_size=step_size)
+        return Search(refiner, budget // GRADIENT, 0, space)
+
+    def hybrid(method: str) -> Search:
+        """CMA-ES for its usual share of the budget, then the gradient."""
+        first = population(17)
+        iterations = round((1 - POLISH) * first.iterations)
+        candidates = 17 * iterations
+        return Search(
+            polished(first.refiner, descent(method).refiner, iterations),
+            iterations + (budget - candidates) // GRADIENT,
+            candidates,
+            first.space,
+        )
+
+    return {
+        "CMA-ES": population(17),
+        "CMA-ES, 64": population(64),
+        "CMA-ES, 256": population(256),
+        "IPOP": population(17, "cma:ipop"),
+        "separable": population(17, "evosax:Sep_CMA_ES"),
+        "hybrid, L-BFGS": hybrid("gradient:lbfgs"),
+        "hybrid, Adam": hybrid("gradient:adam"),
+        "gradient descent": descent("gradient", TUNED["gradient descent"][1].step_size, "raw"),
+        "Adam": descent("gradient:adam"),
+        "L-BFGS": descent("gradient:lbfgs"),
+    }
+
+
+def within(budget: int, search: Search) -> Refiner:
+    """The refiner, stopped once its budget is spent; its last line search may pass it."""
+
+    def step(key, state, objective):
+        state, trace = search.refiner.step(key, state, objective)
+        spent = search.calls(trace.evaluations) >= budget
+        stop = jnp.where(spent & (state.stop == StopReason.RUNNING), StopReason.BUDGET, state.stop)
+        return state._replace(stop=stop), trace
+
+    return Refiner(search.refiner.init, step)
+
+
+def contestant(search: Search, budgets: tuple[int, ...]) -> Contestant:
+    """IoU and objective of the encoder's code, and of the best code within each budget."""
+    refiner = within(budgets[-1], search)
+    config = RefineConfig(iterations=search.iterations, space=search.space)
+
+    def contest(keys, prior, case):
+        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, config)
+        assert found.trace is not None and found.path is not None and found.stop is not None
+        calls = search.calls(found.trace.evaluations)  # after each iteration
+        iterations = jnp.sum(calls[:, None] <= jnp.array((0, *budgets))[:, None], axis=-1)
+        codes = _after(iterations, found.first_code, found.path)
+        return {
+            "iou": iou(decode(prior.params, codes) > 0, case.surface[:, None]),
+            "objective": _after(iterations, found.first_objective, found.trace.best_loss),
+            "calls": calls[:, -1],
+            "ended": found.stop != StopReason.BUDGET,  # by a criterion of its own
+        }
+
+    return contest
+
+
+def _after(
+    iterations: Int[Array, "case budget"],
+    first: Float[Array, "case ..."],
+    later: Float[Array, "case iteration ..."],
+) -> Float[Array, "case budget ..."]:
+    """The value after so many iterations; the first after none."""
+    values = jnp.concatenate([first[:, None], later], axis=1)
+    return values[jnp.arange(len(values))[:, None], iterations]
+
+
+# ------------------------------------------------------------------ what the rows say
+
+
+def curve(journal: Journal, config: Config, group: str, name: str, score: str) -> np.ndarray:
+    """A score of a search by chair, first the encoder's and then within each budget."""
+    return column(journal, group, config.frames, name, score)
+
+
+def seconds_per_call(journal: Journal, config: Config, name: str) -> float:
+    """The median over chairs."""
+    rows = [row[str(config.frames)][name] for row in journal.rows.values()]
+    return float(np.median([row["seconds"] / max(row["calls"], 1) for row in rows]))
+
+
+def shared_seconds(journal: Journal, config: Config) -> float:
+    """The time that the fastest search needs for its whole budget."""
+    return config.budgets[-1] * min(
+        seconds_per_call(journal, config, name) for name in config.searches
+    )
+
+
+def at_time(
+    journal: Journal, config: Config, group: str, name: str, score: str, seconds: float
+) -> np.ndarray:
+    """A score by chair after some seconds, between those of the budgets."""
+    calls = seconds / seconds_per_call(journal, config, name)
+    curves = curve(journal, config, group, name, score)
+    return np.array([np.interp(calls, (0, *config.budgets), values) for values in curves])
+
+
+def agreement(
+    journal: Journal, config: Config, group: str, *, finished: bool = False
+) -> np.ndarray:
+    """Rank correlation by chair between a low objective and a high IoU.
+
+    Over all searches and budgets, the same code counted once; or over the searches that have
+    `finished`, at the whole budget. A chair with fewer than three codes to rank is left out.
+    """
+    found = np.stack(
+        [
+            np.stack([curve(journal, config, group, name, s) for name in config.searches], axis=1)
+            for s in ("objective", "iou")
+        ],
+        axis=-1,
+    )  # chair, search, budget, score
+    pairs = found[:, :, -1] if finished else found.reshape(len(found), -1, 2)
+    distinct = [np.unique(chair, axis=0) for chair in pairs]
+    ranked = [spearmanr(-x[:, 0], x[:, 1]).statistic for x in distinct if len(x) > 2]
+    return np.nan_to_num(np.array(ranked))
+
+
+def last_half(journal: Journal, config: Config, group: str, name: str, score: str) -> np.ndarray:
+    """What the second half of the budget changes, by chair."""
+    middle = 1 + int(np.searchsorted(config.budgets, config.budgets[-1] / 2))
+    values = curve(journal, config, group, name, score)
+    return values[:, -1] - values[:, middle]
+
+
+def summary(journal: Journal, config: Config) -> dict[str, Any]:
+    """Means over chairs: `summary[group]["calls"][score][search]`, a number for each budget."""
+    whole = shared_seconds(journal, config)
+    times = [whole / 8, whole / 4, whole / 2, whole]
+
+    def rounded(values: Any) -> list[float]:
+        return [round(float(x), 4) for x in np.atleast_1d(values)]
+
+    def table(values: Callable[[str, str], Any]) -> dict[str, Any]:
+        return {
+            s: {name: values(name, s) for name in config.searches} for s in ("iou", "objective")
+        }
+
+    def of(group: str) -> dict[str, Any]:
+        return {
+            "calls": table(
+                lambda name, s: rounded(curve(journal, config, group, name, s).mean(axis=0))
+            ),
+            "seconds": table(
+                lambda name, s: rounded(
+                    [at_time(journal, config, group, name, s, t).mean() for t in times]
+                )
+            ),
+            "second half": table(
+                lambda name, s: mean_interval(last_half(journal, config, group, name, s))
+            ),
+            "rank correlation": rounded(agreement(journal, config, group)),
+        }
+
+    return {
+        "calls": [0, *config.budgets],
+        "seconds": rounded(times),
+        "milliseconds per call": {
+            name: round(1000 * seconds_per_call(journal, config, name), 3)
+            for name in config.searches
+        },
+    } | {group: of(group) for group in groups(journal)}
+
+
+def claims(journal: Journal, config: Config) -> list[Claim]:
+    """What the paper says, and what it did not ask, over the chairs of all groups."""
+    budget, whole = config.budgets[-1], shared_seconds(journal, config)
+
+    def pooled(values: Callable[[str], np.ndarray]) -> np.ndarray:
+        return np.concatenate([values(group) for group in groups(journal)])
+
+    def at_calls(name: str, score: str = "iou") -> np.ndarray:
+        return pooled(lambda group: curve(journal, config, group, name, score)[:, -1])
+
+    def in_seconds(name: str) -> np.ndarray:
+        return pooled(lambda group: at_time(journal, config, group, name, "iou", whole))
+
+    def ahead(rival: str) -> np.ndarray:
+        return at_calls("CMA-ES") - at_calls(rival)
+
+    def over(rivals: Sequence[str]) -> str:
+        return ", ".join(f"{mean_interval(ahead(name))} over {name}" for name in rivals)
+
+    def holds(rivals: Sequence[str]) -> str:
+        beaten = [name for name in rivals if ahead(name).mean() > 0]
+        some = f"than {' and '.join(beaten)}" if beaten else "no"
+        return "yes" if beaten == [*rivals] else some
+
+    gradients, populations = (
+        [name for name in names if name in config.searches]
+        for names in (GRADIENTS, ("CMA-ES, 64", "CMA-ES, 256"))
+    )
+    ended = pooled(lambda group: column(journal, group, config.frames, "CMA-ES", "ended"))
+    lowest = min(config.searches, key=lambda name: at_calls(name, "objective").mean())
+    objective, gain = (
+        pooled(lambda group: last_half(journal, config, group, lowest, score))  # noqa: B023
+        for score in ("objective", "iou")
+    )
+    every, final = (
+        pooled(lambda group: agreement(journal, config, group, finished=end))  # noqa: B023
+        for end in (False, True)
+    )
+    return [
+        Claim(
+            "Sec. 3.3",
+            "CMA-ES finds better shapes than gradient descent",
+            f"IoU of CMA-ES at {budget} decoder calls " + over(gradients),
+            holds(gradients),
+        ),
+        _ranked(config.searches, f"Which search is best after {budget} decoder calls?", at_calls),
+        _ranked(config.searches, f"Which search is best after {whole:.1f} s a chair?", in_seconds),
+        Claim(
+            "beyond",
+            "17 candidates are better than more in fewer iterations",
+            f"IoU {over(populations)}",
+            holds(populations),
+        ),
+        Claim(
+            "beyond",
+            "Restarts help",
+            f"CMA-ES ends by itself within {budget} calls on {ended.sum()} of {len(ended)} chairs",
+            "nothing to restart"
+            if not ended.any()
+            else "yes"
+            if ahead("IPOP").mean() < 0
+            else "no",
+        ),
+        Claim(
+            "beyond",
+            "A lower objective is a better shape",
+            f"Rank correlation by chair {mean_interval(every)} over all searches and budgets,"
+            f" {mean_interval(final)} among searches that have spent theirs",
+            "along a search"
+            if every.mean() > 0.5 > final.mean()
+            else "yes"
+            if final.mean() > 0.5
+            else "no",
+        ),
+        Claim(
+            "beyond",
+            "IoU still rises while the lowest objective falls further",
+            f"In the second half of the budget of {lowest}: objective {objective.mean():+.4f}, IoU"
+            f" {mean_interval(gain)}, falling on {np.mean(gain[objective < 0] < 0):.0%} of chairs",
+            "yes" if interval(gain[:, None])[0, 0] > 0 else "not to speak of",
+        ),
+    ]
+
+
+def _ranked(searched: Sequence[str], question: str, scores: Callable[[str], np.ndarray]) -> Claim:
+    """The searches by their mean IoU."""
+    ranked = sorted(searched, key=lambda name: -scores(name).mean())
+    order = ", ".join(f"{name} {scores(name).mean():.3f}" for name in ranked)
+    lead = mean_interval(scores(ranked[0]) - scores("CMA-ES"))
+    return Claim("beyond", question, f"IoU {order}; the first over CMA-ES {lead}", ranked[0])
+
+
+# ------------------------------------------------------------------ figure
+
+
+def plot(journal: Journal, config: Config) -> None:
+    """IoU and objective by decoder calls, and one against the other; a row for each group."""
+
+    def means(group: str, name: str, score: str) -> np.ndarray:
+        return curve(journal, config, group, name, score).mean(axis=0)
+
+    def draw(figure: Any) -> None:
+        found = groups(journal)
+        for row, group in zip(figure.subplots(len(found), 3, squeeze=False), found, strict=True):
+            for name in config.searches:
+                line = DRAWN[name]
+                shape, objective = (means(group, name, score) for score in ("iou", "objective"))
+                row[0].plot(config.budgets, shape[1:], label=name, **line)
+                row[1].plot(config.budgets, objective[1:], **line)
+                row[2].plot(objective, shape, marker=".", markersize=4, linewidth=0.8, **line)
+            for axes, score in zip(row, ("iou", "objective"), strict=False):
+                axes.axhline(means(group, "CMA-ES", score)[0], color=GREY, linewidth=0.8)
+                axes.set(xscale="log", xlabel="decoder calls")
+                ticks = config.budgets[::2]
+                axes.set_xticks(ticks, [str(k) for k in ticks])
+                axes.minorticks_off()
+            count = len(curve(journal, config, group, "CMA-ES", "iou"))
+            row[0].set(title=f"{count} {group} chairs", ylabel="IoU")
+            row[1].set(ylabel="objective")
+            row[2].set(xlabel="objective", ylabel="IoU")
+            row[2].invert_xaxis()
+            for axes in row:
+                tidy(axes)
+        figure.legend(
+            *row[0].get_legend_handles_labels(), frameon=False, ncols=5, loc="outside lower center"
+        )
+
+    save_column(
+        config.results / "equal_budget", draw, height=0.6 + 2.0 * len(groups(journal)), width=PAGE
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,409 @@
+r"""Where gradients stall and CMA-ES goes on, and the opposite cases (paper, Fig. gm_fail).
+
+    python experiments/gradient_failures.py --test.meshes cad_chairs/
+
+After 1, 4 and 8 frames, the two chairs on which CMA-ES leads plain descent most, by IoU, and the
+two on which it trails most: of all chairs where iou_by_frames.py has left its results in the same
+folder, else of 32 that are searched shortly here. Those few are then searched by plain descent,
+Adam and CMA-ES for the paper's 350 iterations, and every search goes on for as long from where
+every other one has ended. That tells a local minimum from a slow search: in a minimum nothing moves
+but what can leave it. The straight line between two ends is followed as well: where the objective
+never rises above both, no ridge parts them.
+
+Chairs that were chosen as extremes show what can happen, not how often; that is in the shares of
+all chairs.
+
+Results: experiments/results/gradient_failures.json, and .png and .svg of those on which CMA-ES
+leads; those on which it trails are in gradient_failures_opposite. Chairs that are done are kept.
+Time: 8 minutes on two cores after iou_by_frames.py, 10 without.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Array, Float
+from rich.progress import track
+
+from jaxshape.data.dataset import load_object
+from jaxshape.data.meshes import Skipped
+from jaxshape.model.autoencoder import decode
+from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.objective import cross_entropy, target
+from jaxshape.refine.reconstruction import reconstruct, refiner_for
+from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
+from jaxshape.results.figures import PAGE, save_column
+from jaxshape.results.journal import Journal
+from jaxshape.results.metrics import iou
+from jaxshape.results.pictures import grid_panel, measurement_panel
+from jaxshape.results.study import TUNED, Claim, Subject, TestSet, compare, subjects, tuned
+
+RESULTS = Path(__file__).parent / "results"
+SHAPES = ("encoder", *TUNED)
+LEADS, TRAILS = "CMA-ES leads", "CMA-ES trails"
+POINTS = 21
+"""On the line between two codes, its ends included."""
+RIDGE = 0.01
+"""Rise over the higher end, as a share of it, that counts as a ridge."""
+
+Rows = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the experiment."""
+
+    test: TestSet = TestSet()
+    frames: tuple[int, ...] = (1, 4, 8)
+    examples: int = 2
+    """Chairs of either kind for each number of frames."""
+    iterations: int = 350
+    """Of the searches on those (paper: 350)."""
+    candidates: int = 32
+    """Chairs to choose from where iou_by_frames.py has not been run."""
+    short: int = 60
+    """Iterations of the searches on the candidates."""
+    results: Path = RESULTS
+    smoke: bool = False
+    """Two procedural chairs and few iterations: does it run?"""
+
+
+def main(config: Config) -> None:
+    if config.smoke:
+        test = replace(config.test, chairs=2, seats=0)
+        few = {"frames": (4,), "examples": 1, "iterations": 2, "short": 2}
+        config = replace(config, test=test, **few)
+    journal = run(config)
+    plot(journal, config)
+
+
+def run(config: Config) -> Journal:
+    """Choose the chairs, search them long, and write what was found."""
+    prior = load_prior()
+    candidates = short_searches(prior, config)
+    chosen = choose(candidates, config)
+    settings = {
+        "iterations": config.iterations,
+        "chosen": [one[:3] for one in chosen],
+        "weights": fingerprint(prior),
+    }
+    journal = Journal(config.results / "gradient_failures.json", settings)
+    search_long(chosen, prior, config, journal)
+    shares = {str(k): wins(candidates, k) for k in config.frames}
+    journal.write(
+        {
+            "claims": [claim._asdict() for claim in claims(journal, shares, config)],
+            "summary": {"shares": shares, "cases": summary(journal)},
+        }
+    )
+    return journal
+
+
+# ------------------------------------------------------------------ which chairs
+
+
+class Example(NamedTuple):
+    """A chair after some number of frames, and why it was chosen."""
+
+    name: str
+    frames: int
+    kind: str
+    lead: float
+    """IoU of CMA-ES over plain descent after short searches."""
+
+
+def short_searches(prior: ShapePrior, config: Config) -> Rows:
+    """Scores of short searches by chair, as `compare` leaves them."""
+    known = {one.name for one in subjects(config.test)}
+    earlier = config.results / "iou_by_frames.json"
+    if earlier.is_file():
+        rows = json.loads(earlier.read_text())["rows"]
+        rows = {name: row for name, row in rows.items() if name in known}
+        if rows and all(str(k) in row for row in rows.values() for k in config.frames):
+            return rows
+    settings = {
+        "frames": config.frames,
+        "iterations": config.short,
+        "weights": fingerprint(prior),
+    }
+    journal = Journal(config.results / "gradient_failures_candidates.json", settings)
+    contestants = tuned(prior, config.short)
+    chairs = subjects(config.test)[: config.candidates]
+    compare(contestants, prior, chairs, config.frames, journal, at_a_time=24)
+    return journal.rows
+
+
+def leads(rows: Rows, frames: int, rival: str) -> dict[str, float]:
+    """IoU of CMA-ES over a rival's by chair."""
+    scores = {name: row[str(frames)] for name, row in rows.items()}
+    return {name: s["CMA-ES"]["iou"] - s[rival]["iou"] for name, s in scores.items()}
+
+
+def choose(rows: Rows, config: Config) -> list[Example]:
+    """The chairs with the largest differences of either sign, by number of frames."""
+    chosen = []
+    for k in config.frames:
+        lead = leads(rows, k, "gradient descent")
+        ranked = sorted(lead, key=lambda name: -lead[name])  # noqa: B023
+        kinds = {LEADS: ranked[: config.examples], TRAILS: ranked[::-1][: config.examples]}
+        chosen += [
+            Example(name, k, kind, round(lead[name], 4))
+            for kind, names in kinds.items()
+            for name in names
+        ]
+    return chosen
+
+
+def wins(rows: Rows, frames: int) -> dict[str, dict[str, float]]:
+    """On what share of the chairs CMA-ES has the higher IoU, and its mean and extreme leads."""
+    found = {}
+    for rival in ("gradient descent", "Adam"):
+        lead = np.array(list(leads(rows, frames, rival).values()))
+        figures = {"share": (lead > 0).mean(), "mean": lead.mean()}
+        figures |= {"least": lead.min(), "most": lead.max(), "chairs": len(lead)}
+        found[rival] = {name: round(float(x), 4) for name, x in figures.items()}
+    return found
+
+
+# ------------------------------------------------------------------ long searches
+
+
+class Ends(NamedTuple):
+    """Where searches have ended."""
+
+    code: Float[Array, "case d"]
+    objective: Float[Array, " case"]
+    iou: Float[Array, " case"]
+
+
+def search_long(
+    chosen: Sequence[Example], prior: ShapePrior, config: Config, journal: Journal
+) -> None:
+    """A row for every example that has none: all searches, and all from the end of each."""
+    chairs = {one.name: one for one in subjects(config.test)}
+    missing = [one for one in chosen if row_name(one) not in journal.rows]
+    size = min(2 * config.examples, len(missing))
+    analyse = analysis(prior, config)
+    starts = range(0, len(missing), max(size, 1))
+    for start in track(starts, description=journal.path.stem, disable=not missing):
+        began = time.perf_counter()
+        batch = missing[start : start + size]
+        cases = [seen(chairs[one.name], one.frames) for one in batch]
+        keys = jnp.concatenate([case_keys(one.name, (one.frames,)) for one in batch])
+        case = jax.tree.map(lambda *x: jnp.stack(x), *cases)
+        keys, case = jax.tree.map(lambda x: fill(x, size), (keys, case))
+        found = jax.device_get(analyse(keys, case))
+        rows = {
+            row_name(one): one._asdict()
+            | {"group": chairs[one.name].group}
+            | jax.tree.map(lambda x, i=i: np.round(x[i], 5).tolist(), found)
+            for i, one in enumerate(batch)
+        }
+        journal.add(rows, time.perf_counter() - began)
+
+
+def row_name(one: Example) -> str:
+    return f"{one.name}, {one.frames} frames, {one.kind}"
+
+
+def seen(chair: Subject, frames: int) -> Case:
+    """What the first frames show; the chair has been used before, so it can be."""
+    model = load_object(chair.item)
+    case = None if isinstance(model, Skipped) else observe(model, EvaluateConfig((frames,)))
+    if case is None:
+        raise ValueError(f"{chair.name} cannot be observed: {model}. Remove the earlier results.")
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), case)
+
+
+def analysis(prior: ShapePrior, config: Config) -> Callable[..., dict[str, Any]]:
+    """What a row holds, from the keys and cases of a batch; each search is compiled once."""
+    first = searcher("encoder", prior, RefineConfig())
+    searches = {
+        name: searcher(method, prior, replace(how, iterations=config.iterations, tolerance=0.0))
+        for name, (method, how) in TUNED.items()
+    }
+    follow = jax.jit(objectives_between)
+
+    def analyse(keys, case):
+        begun = first(keys, prior, case, None)
+        ended = {name: search(keys, prior, case, begun.code) for name, search in searches.items()}
+        again = {
+            start: {name: search(keys, prior, case, end.code) for name, search in searches.items()}
+            for start, end in ended.items()
+        }
+        found = {"encoder": begun} | ended
+        return {
+            "iou": {name: end.iou for name, end in found.items()},
+            "objective": {name: end.objective for name, end in found.items()},
+            "again": {
+                start: {name: end.objective for name, end in ends.items()}
+                for start, ends in again.items()
+            },
+            "line": {
+                name: follow(prior, case, begun.code, end.code, ended["CMA-ES"].code)
+                for name, end in ended.items()
+                if name != "CMA-ES"
+            },
+            "code": {name: end.code for name, end in found.items()},
+        }
+
+    return analyse
+
+
+def searcher(method: str, prior: ShapePrior, config: RefineConfig) -> Callable[..., Ends]:
+    """A compiled search that begins at given codes."""
+    refiner = refiner_for(method, prior, config)
+
+    @jax.jit
+    def search(keys, prior, case, codes):
+        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, config, codes)
+        return Ends(found.code, found.objective, iou(found.completed, case.surface))
+
+    return search
+
+
+def objectives_between(
+    prior: ShapePrior,
+    case: Case,
+    first: Float[Array, "case d"],
+    a: Float[Array, "case d"],
+    b: Float[Array, "case d"],
+) -> Float[Array, "case point"]:
+    """The objective along the straight line from one code to another."""
+    targets = target(case.occupied, case.occluded, decode(prior.params, first))
+    share = jnp.linspace(0, 1, POINTS)[:, None]
+    codes = a[:, None] + share * (b - a)[:, None]
+    return cross_entropy(decode(prior.params, codes), jax.tree.map(lambda x: x[:, None], targets))
+
+
+# ------------------------------------------------------------------ what the rows say
+
+
+def drop(row: Rows, start: str, search: str) -> float:
+    """By what share `search` lowers the objective from where `start` has ended."""
+    return 1 - row["again"][start][search] / row["objective"][start]
+
+
+def ridge(row: Rows, rival: str) -> float:
+    """Rise on the line from the rival's end to that of CMA-ES, as a share of the higher end."""
+    line = np.array(row["line"][rival])
+    return float(line.max() / max(line[0], line[-1]) - 1)
+
+
+def summary(journal: Journal) -> dict[str, Any]:
+    """What decides on each case, without codes."""
+    return {
+        name: {
+            "iou": row["iou"],
+            "objective": row["objective"],
+            "falls further": {
+                start: {search: round(drop(row, start, search), 4) for search in TUNED}
+                for start in TUNED
+            },
+            "ridge": {rival: round(ridge(row, rival), 4) for rival in row["line"]},
+        }
+        for name, row in journal.rows.items()
+    }
+
+
+def claims(journal: Journal, shares: dict[str, Any], config: Config) -> list[Claim]:
+    """What the paper says of this figure, the opposite, and how often either happens."""
+    ahead, behind = (
+        [row for row in journal.rows.values() if row["kind"] == kind] for kind in (LEADS, TRAILS)
+    )
+    return [
+        _trapped(ahead, "gradient descent", "CMA-ES", config),
+        _trapped(behind, "CMA-ES", "gradient descent", config),
+        _how_often(shares),
+    ]
+
+
+def _trapped(rows: Sequence[Rows], loser: str, winner: str, config: Config) -> Claim:
+    """Has the loser ended in a local minimum that the winner leaves, or was it only slow?"""
+    own, others, adam = (
+        np.array([drop(row, loser, name) for row in rows]) for name in (loser, winner, "Adam")
+    )
+    lower = np.array([row["objective"][winner] < row["objective"][loser] for row in rows])
+    better = np.array([row["iou"][winner] > row["iou"][loser] for row in rows])
+    ridges = np.array([ridge(row, "gradient descent") > RIDGE for row in rows])
+    trapped = (others > 0.01) & (own < others / 10)
+    count = len(rows)
+    return Claim(
+        "Fig. gm_fail" if loser == "gradient descent" else "beyond",
+        f"{loser} is trapped in a local minimum that {winner} gets out of",
+        f"the {count} chairs with the largest lead of {winner} after short searches: after"
+        f" {config.iterations} iterations it is still better on {better.sum()} and lower on"
+        f" {lower.sum()}; from where {loser} has ended {winner} lowers the objective by"
+        f" {others.mean():.1%}, {loser} by {own.mean():.1%} and Adam by {adam.mean():.1%}; a ridge"
+        f" parts the two ends on {ridges.sum()}",
+        f"on {trapped.sum()} of {count}" if trapped.any() else "no",
+    )
+
+
+def _how_often(shares: dict[str, Any]) -> Claim:
+    """On what share of all chairs CMA-ES is better."""
+    texts = [
+        f"{k} frames: better than descent on {found['gradient descent']['share']:.0%}"
+        f" ({found['gradient descent']['mean']:+.3f}), than Adam on {found['Adam']['share']:.0%}"
+        f" ({found['Adam']['mean']:+.3f})"
+        for k, found in shares.items()
+    ]
+    most = [found["gradient descent"]["share"] > 0.5 for found in shares.values()]
+    chairs = next(iter(shares.values()))["Adam"]["chairs"]
+    return Claim(
+        "Fig. gm_fail",
+        "CMA-ES uses additional frames where gradient descent is stuck",
+        f"IoU of {chairs:.0f} chairs after short searches, " + "; ".join(texts),
+        "on most chairs" if all(most) else "on few chairs" if not any(most) else "in part",
+    )
+
+
+# ------------------------------------------------------------------ figures
+
+
+def plot(journal: Journal, config: Config) -> None:
+    """One figure for the chairs on which CMA-ES leads, one for those on which it trails."""
+    prior = load_prior()
+    for kind, suffix in ((LEADS, ""), (TRAILS, "_opposite")):
+        rows = [row for row in journal.rows.values() if row["kind"] == kind]
+        pictures = [list(panels(row, prior, config)) for row in rows]
+
+        def draw(figure: Any, rows=rows, pictures=pictures) -> None:
+            every = figure.subplots(len(rows), len(pictures[0]), squeeze=False)
+            for axes, row, images in zip(every, rows, pictures, strict=True):
+                for place, panel in zip(axes, images, strict=True):
+                    place.imshow(panel.image)
+                    place.set(xticks=[], yticks=[], xlabel=panel.note)
+                    place.spines[:].set_visible(False)
+                    if axes is every[0]:
+                        place.set_title(panel.title)
+                frames = "1 frame" if row["frames"] == 1 else f"{row['frames']} frames"
+                axes[0].set_ylabel(frames)
+
+        stem = config.results / f"gradient_failures{suffix}"
+        save_column(stem, draw, height=0.3 + 1.3 * len(rows), width=PAGE)
+
+
+def panels(row: Rows, prior: ShapePrior, config: Config) -> Iterator[Any]:
+    """Truth, F and every search's shape, its IoU below."""
+    chair = next(one for one in subjects(config.test) if one.name == row["name"])
+    occupied, occluded, surface = (np.asarray(x) for x in seen(chair, row["frames"]))
+    codes = jnp.array([row["code"][name] for name in SHAPES])
+    shapes = np.asarray(decode(prior.params, codes) > 0)
+    yield grid_panel("truth", surface, "truth", note=row["group"])
+    yield measurement_panel("F", occupied, occluded, note=" ")
+    for name, shape in zip(SHAPES, shapes, strict=True):
+        title = "descent" if name == "gradient descent" else name
+        yield grid_panel(title, shape, "predicted", note=f"{row['iou'][name]:.3f}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

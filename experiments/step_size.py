@@ -1,0 +1,455 @@
+r"""Steps of gradient descent and of Adam, and sigma0 of CMA-ES (paper, Fig. gm right).
+
+    python experiments/step_size.py --test.meshes cad_chairs/
+
+12 procedural chairs and 8 CAD seats, each seen in 1, 4 and 8 frames. Every search starts from the
+encoder's code and has 60 iterations, in the codes themselves as in the paper (where 0.14 is its
+step and 2 its sigma0) or in whitened codes. The paper does not say what it averages; here a value
+is as good as the objective falls with it, as a part of what the best value of its method attains,
+and the default of each method is held against the best.
+
+Results: experiments/results/step_size.json, .png and .svg, and the searches along their way in
+step_size_curves.png and .svg; chairs that are done are kept. Time: 15 minutes on two cores.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import tyro
+from jaxtyping import Array
+
+from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
+from jaxshape.refine.reconstruction import reconstruct, refiner_for
+from jaxshape.refine.refiner import Refiner
+from jaxshape.results.evaluation import Case
+from jaxshape.results.figures import BLUE, GREEN, ORANGE, PAGE, draw_mean, save_column, tidy
+from jaxshape.results.journal import Journal
+from jaxshape.results.metrics import iou
+from jaxshape.results.study import Claim, Contestant, Scores, TestSet, compare, mean_interval
+
+RESULTS = Path(__file__).parent / "results"
+CASES_AT_A_TIME = 15
+WORST = 99.0
+"""Stands for a loss that is not finite, which JSON does not have."""
+
+
+class Trial(NamedTuple):
+    """A step, or the sigma0 of CMA-ES, in the coordinates of a space."""
+
+    space: str
+    step: float
+
+
+def grid(raw: set[float], whitened: set[float]) -> list[Trial]:
+    steps = {"raw": raw, "whitened": whitened}
+    return [Trial(space, step) for space in steps for step in sorted(steps[space])]
+
+
+DESCENT = "gradient descent"
+DEFAULTS = {
+    DESCENT: Trial("whitened", STEP_SIZES["whitened"]),
+    "Adam": Trial("whitened", LEARNING_RATE),
+    "CMA-ES": Trial("whitened", RefineConfig().sigma0),
+}
+PAPERS = {DESCENT: Trial("raw", 0.14), "CMA-ES": Trial("raw", 2.0)}
+TRIALS = {
+    DESCENT: grid({0.02, 0.14, 1.4, 5.0, 14.0, 40.0}, {2.0, 7.0, DEFAULTS[DESCENT].step, 40.0}),
+    "Adam": grid(set(), {0.01, 0.03, DEFAULTS["Adam"].step, 0.3}),
+    "CMA-ES": grid({0.04, 0.14, 2.0}, {0.03, DEFAULTS["CMA-ES"].step, 0.3, 1.0}),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the experiment."""
+
+    test: TestSet = TestSet(chairs=12, seats=8)
+    frames: tuple[int, ...] = (1, 4, 8)
+    """Numbers of frames that are fused."""
+    iterations: int = 60
+    """Of every search."""
+    results: Path = RESULTS
+    smoke: bool = False
+    """Two procedural chairs and few iterations: does it run?"""
+
+
+def main(config: Config) -> None:
+    if config.smoke:
+        test = replace(config.test, chairs=2, seats=0)
+        config = replace(config, test=test, frames=(1, 4), iterations=2)
+    journal = run(config)
+    plot(journal, config)
+    plot_curves(journal, config)
+
+
+def run(config: Config) -> Journal:
+    """Try every value on every chair, and write what was found."""
+    prior = load_prior()
+    settings = {
+        "frames": config.frames,
+        "iterations": config.iterations,
+        "trials": TRIALS,
+        "weights": fingerprint(prior),
+        # Root mean square over the coordinates of the codes' standard deviations.
+        "deviation_of_codes": round(float(jnp.sqrt(jnp.diag(prior.code_covariance).mean())), 4),
+    }
+    journal = Journal(config.results / "step_size.json", settings)
+    search = RefineConfig(iterations=config.iterations, tolerance=0.0)
+    population = refiner_for("cma", prior, replace(search, sigma0=1.0))
+    assert population is not None
+    # A population of sigma0 = s is one of sigma0 = 1 in a space that is s times as wide.
+    contestants = {
+        DESCENT: trying(DESCENT, lambda step: (gradient(optax.sgd(step)), 1.0), prior, search),
+        "Adam": trying("Adam", lambda step: (gradient(optax.adam(step)), 1.0), prior, search),
+        "CMA-ES": trying("CMA-ES", lambda step: (population, step), prior, search),
+    }
+    compare(contestants, prior, config.test, config.frames, journal, at_a_time=CASES_AT_A_TIME)
+    journal.write(
+        {
+            "claims": [claim._asdict() for claim in claims(journal, config)],
+            "summary": summary(journal, config),
+        }
+    )
+    return journal
+
+
+def trying(
+    method: str,
+    search_with: Callable[[Array], tuple[Refiner, Array | float]],
+    prior: ShapePrior,
+    config: RefineConfig,
+) -> Contestant:
+    """The contestant that searches with every value of a method, one after another.
+
+    `search_with` a value gives the refiner and how wide its space is. The values are data, so that
+    one program does for all.
+    """
+    steps = jnp.array([trial.step for trial in TRIALS[method]])
+    is_raw = jnp.array([trial.space == "raw" for trial in TRIALS[method]])
+    often = jnp.array(sampled(config.iterations)) - 1
+
+    def contest(keys: Array, prior: ShapePrior, case: Case) -> Scores:
+        def attempt(value: tuple[Array, Array]) -> dict[str, Array]:
+            step, is_raw = value
+            refiner, width = search_with(step)
+            covariance = jnp.where(is_raw, jnp.eye(len(prior.code_mean)), prior.code_covariance)
+            space = prior._replace(code_covariance=width**2 * covariance)
+            found = reconstruct(keys, space, case.occupied, case.occluded, refiner, config)
+            assert found.trace is not None
+            drawn = jnp.nan_to_num(found.trace.loss, posinf=WORST)
+            return {
+                "start": found.first_objective,
+                "start_iou": iou(found.completed_first, case.surface),
+                "objective": found.objective,
+                "iou": iou(found.completed, case.surface),
+                "rises": jnp.mean(jnp.diff(drawn) > 0, axis=1),
+                "last": drawn[:, -1],
+                "moved": jnp.sqrt(jnp.mean((found.code - found.first_code) ** 2, axis=1)),
+                "drawn": drawn[:, often],
+            }
+
+        scores = jax.lax.map(attempt, (steps, is_raw))
+        return {name: values.swapaxes(0, 1) for name, values in scores.items()}
+
+    return contest
+
+
+def sampled(iterations: int) -> list[int]:
+    """About ten iterations, evenly spaced in their logarithm, counted from 1."""
+    return sorted(set(np.geomspace(1, iterations, 12).round().astype(int).tolist()))
+
+
+def scores(journal: Journal, frames: int, method: str, score: str) -> np.ndarray:
+    """One score of all values of a method on all chairs: [chair trial ...]."""
+    rows = journal.rows.values()
+    return np.array([row[str(frames)][method][score] for row in rows])
+
+
+def fall(journal: Journal, frames: int, method: str) -> np.ndarray:
+    """Mean fall of the objective with each value, as a part of the largest."""
+    fallen = (
+        scores(journal, frames, method, "start") - scores(journal, frames, method, "objective")
+    ).mean(axis=0)
+    return fallen / max(fallen.max(), 1e-12)
+
+
+def gain(journal: Journal, frames: int, method: str) -> np.ndarray:
+    """Gain in IoU over the encoder with each value: [chair trial]."""
+    return scores(journal, frames, method, "iou") - scores(journal, frames, method, "start_iou")
+
+
+def overshoots(journal: Journal, frames: int, method: str) -> np.ndarray:
+    """On what part of the chairs the last loss is above the first, with each value."""
+    last, start = (scores(journal, frames, method, score) for score in ("last", "start"))
+    return (last > start).mean(axis=0)
+
+
+def best_of(journal: Journal, config: Config, method: str) -> dict[str, Trial]:
+    """The value with the largest fall: for each number of frames, and for all in the mean."""
+    falls = {str(k): fall(journal, k, method) for k in config.frames}
+    falls["all"] = np.mean(list(falls.values()), axis=0)
+    return {k: TRIALS[method][int(np.argmax(values))] for k, values in falls.items()}
+
+
+def best_in(journal: Journal, config: Config, method: str, space: str) -> Trial:
+    """The best value in one of the spaces, over all numbers of frames."""
+    falls = np.mean([fall(journal, k, method) for k in config.frames], axis=0)
+    trials = [(part, trial) for part, trial in zip(falls, TRIALS[method], strict=True)
+              if trial.space == space]  # fmt: skip
+    return max(trials)[1]
+
+
+def summary(journal: Journal, config: Config) -> dict[str, Any]:
+    """The best values, and for each value and number of frames what it attains."""
+
+    def of(method: str, k: int) -> dict[str, Any]:
+        means = {
+            "objective": scores(journal, k, method, "objective").mean(axis=0),
+            "part_of_best_fall": fall(journal, k, method),
+            "iou_gained": gain(journal, k, method).mean(axis=0),
+            "overshoots": overshoots(journal, k, method),
+            "rises": scores(journal, k, method, "rises").mean(axis=0),
+            "moved": scores(journal, k, method, "moved").mean(axis=0),
+        }
+        return {
+            text(trial): {name: float(f"{values[i]:.4g}") for name, values in means.items()}
+            for i, trial in enumerate(TRIALS[method])
+        }
+
+    return {
+        method: {"best": {k: text(trial) for k, trial in best_of(journal, config, method).items()}}
+        | {str(k): of(method, k) for k in config.frames}
+        for method in TRIALS
+    }
+
+
+def text(trial: Trial) -> str:
+    return f"{trial.step:g} {'in codes' if trial.space == 'raw' else 'whitened'}"
+
+
+def parts(journal: Journal, config: Config, method: str, trial: Trial) -> list[float]:
+    """What part of the best fall a value attains, for each number of frames."""
+    i = TRIALS[method].index(trial)
+    return [float(fall(journal, k, method)[i]) for k in config.frames]
+
+
+def percents(journal: Journal, config: Config, method: str, trial: Trial) -> str:
+    return ", ".join(f"{part:.0%}" for part in parts(journal, config, method, trial))
+
+
+def claims(journal: Journal, config: Config) -> list[Claim]:
+    """What the paper says of this figure, what is found here, and what follows."""
+    return [
+        papers_step(journal, config),
+        papers_sigma(journal, config),
+        papers_scales(journal, config),
+        steady(journal, config),
+        defaults(journal, config),
+        spaces(journal, config),
+    ]
+
+
+def papers_step(journal: Journal, config: Config) -> Claim:
+    method, trial = DESCENT, PAPERS[DESCENT]
+    best = best_in(journal, config, method, "raw")
+    raw = [i for i, one in enumerate(TRIALS[method]) if one.space == "raw"]
+    ending_above = np.max([overshoots(journal, k, method) for k in config.frames], axis=0)
+    too_long = [TRIALS[method][i].step for i in raw if ending_above[i] > 0.1]
+    is_fast = min(parts(journal, config, method, trial)) > 0.8
+    is_kept = trial.step not in too_long
+
+    def moved(trial: Trial) -> float:
+        i = TRIALS[method].index(trial)
+        lengths = [scores(journal, k, method, "moved")[:, i] for k in config.frames]
+        return float(np.mean(lengths)) / journal.settings["deviation_of_codes"]
+
+    return Claim(
+        "Fig. gm right",
+        "A step of 0.14 leads to fast convergence without overshooting",
+        f"{percents(journal, config, method, trial)} of the fall of the best step at"
+        f" {_listed(config.frames)} frames, in {config.iterations} iterations: it moves codes by"
+        f" {moved(trial):.2f} of their standard deviation, {text(best)}, the best in the same"
+        f" space, by {moved(best):.2f}; more than a tenth of the chairs end above the start with"
+        f" {'steps of ' + _listed(too_long) if too_long else 'none of the steps'}",
+        "yes" if is_fast and is_kept else "not fast" if is_kept else "no",
+    )
+
+
+def papers_sigma(journal: Journal, config: Config) -> Claim:
+    method, trial = "CMA-ES", PAPERS["CMA-ES"]
+    deviation = journal.settings["deviation_of_codes"]
+    return Claim(
+        "Sec. 4",
+        "sigma0 = 2 is best for CMA-ES",
+        f"{percents(journal, config, method, trial)} of the fall of the best sigma0 at"
+        f" {_listed(config.frames)} frames: 2 is {trial.step / deviation:.1f} deviations of"
+        f" the codes; best in the same space is {text(best_in(journal, config, method, 'raw'))}",
+        "yes" if min(parts(journal, config, method, trial)) > 0.9 else "no",
+    )
+
+
+def papers_scales(journal: Journal, config: Config) -> Claim:
+    """Codes c times as long want c times the sigma0, and c^2 times the step."""
+    sigma, step = (best_in(journal, config, method, "raw").step for method in ("CMA-ES", DESCENT))
+    longer = PAPERS["CMA-ES"].step / sigma
+    louder = longer**2 * step / PAPERS[DESCENT].step
+    return Claim(
+        "beyond",
+        "The paper's two values follow from the scale of its codes and of its loss",
+        f"2 would be the best sigma0 for codes {longer:.0f} times as long; 0.14 were then the best"
+        f" step for a loss {louder:.1g} times as large (that without the 1 / N^3 is 3e+04 times as"
+        " large)",
+        "plausible" if 0.1 < louder / RESOLUTION**3 < 10 else "not from these two alone",
+    )
+
+
+def steady(journal: Journal, config: Config) -> Claim:
+    best = {method: best_of(journal, config, method) for method in TRIALS}
+    return Claim(
+        "beyond",
+        f"One value does for {_listed(config.frames)} frames",
+        "; ".join(
+            f"{method}: best {_listed([text(best[method][str(k)]) for k in config.frames])}; over"
+            f" all {text(best[method]['all'])} with"
+            f" {percents(journal, config, method, best[method]['all'])} of the best falls"
+            for method in TRIALS
+        ),
+        _which({m: min(parts(journal, config, m, best[m]["all"])) > 0.9 for m in TRIALS}),
+    )
+
+
+def defaults(journal: Journal, config: Config) -> Claim:
+    def against_best(method: str) -> str:
+        here = TRIALS[method].index(DEFAULTS[method])
+        best = best_of(journal, config, method)
+        differences = [
+            gain(journal, k, method)[:, here]
+            - gain(journal, k, method)[:, TRIALS[method].index(best[str(k)])]
+            for k in config.frames
+        ]
+        return (
+            f"{method}, {text(DEFAULTS[method])}:"
+            f" {percents(journal, config, method, DEFAULTS[method])} of the best falls, IoU"
+            f" {mean_interval(np.concatenate(differences))} against the best"
+        )
+
+    return Claim(
+        "beyond",
+        "The defaults are as good as the best values",
+        "; ".join(map(against_best, TRIALS)),
+        _which({m: min(parts(journal, config, m, DEFAULTS[m])) > 0.9 for m in TRIALS}),
+    )
+
+
+def spaces(journal: Journal, config: Config) -> Claim:
+    best = {
+        method: [best_in(journal, config, method, space) for space in ("raw", "whitened")]
+        for method in PAPERS
+    }
+    return Claim(
+        "beyond",
+        "The codes themselves serve as well as whitened ones",
+        "; ".join(
+            f"{method}: "
+            + ", ".join(f"{text(t)} {percents(journal, config, method, t)}" for t in best[method])
+            + " of the best falls"
+            for method in PAPERS
+        ),
+        _which({m: min(parts(journal, config, m, best[m][0])) > 0.9 for m in PAPERS}),
+    )
+
+
+def _listed(values: Sequence[Any]) -> str:
+    return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in values)
+
+
+def _which(holds: dict[str, bool]) -> str:
+    names = [name for name, does in holds.items() if does]
+    return "yes" if len(names) == len(holds) else f"of {' and '.join(names)}" if names else "no"
+
+
+def plot(journal: Journal, config: Config) -> None:
+    """A column of panels for each method: fall of the objective above, gain in IoU below."""
+    markers = dict(zip(config.frames, ("o", "s", "^"), strict=False))
+    colors = dict(zip(config.frames, (ORANGE, GREEN, BLUE), strict=False))
+    dashes = {"raw": (3, 1.5), "whitened": ()}
+
+    def draw(figure: Any) -> None:
+        upper, lower = figure.subplots(2, len(TRIALS), sharex="col", sharey="row")
+        for method, above, below in zip(TRIALS, upper, lower, strict=True):
+            for k in config.frames:
+                for space, dash in dashes.items():
+                    chosen = [i for i, trial in enumerate(TRIALS[method]) if trial.space == space]
+                    if not chosen:
+                        continue
+                    steps = [TRIALS[method][i].step for i in chosen]
+                    start = scores(journal, k, method, "start")[:, chosen]
+                    left = scores(journal, k, method, "objective")[:, chosen] / start
+                    style = {"color": colors[k], "dashes": dash, "marker": markers[k], "ms": 3}
+                    draw_mean(above, steps, left, **style)
+                    draw_mean(below, steps, gain(journal, k, method)[:, chosen], **style)
+            below.set(xscale="log", xlabel="sigma0" if method == "CMA-ES" else "step")
+            above.set_title(method)
+            for axes in (above, below):
+                axes.axvline(DEFAULTS[method].step, color="#8C949B", lw=0.8, zorder=0)
+                if method in PAPERS:
+                    axes.axvline(PAPERS[method].step, color="#8C949B", lw=0.8, ls=":", zorder=0)
+                tidy(axes)
+            below.xaxis.set_major_formatter("{x:g}")
+        upper[0].set_ylabel("objective / start")
+        lower[0].set_ylabel("IoU over encoder")
+        for k in config.frames:
+            lower[0].plot([], [], color=colors[k], marker=markers[k], ms=3, label=f"{k} frames")
+        for space, dash in dashes.items():
+            name = "codes" if space == "raw" else "whitened"
+            lower[0].plot([], [], color="#2B2F33", dashes=dash, label=name)
+        lower[1].plot([], [], color="#8C949B", lw=0.8, label="default")
+        lower[1].plot([], [], color="#8C949B", lw=0.8, ls=":", label="paper")
+        figure.legend(frameon=False, loc="outside lower center", ncols=7)
+
+    save_column(config.results / "step_size", draw, height=4.2, width=PAGE)
+
+
+def plot_curves(journal: Journal, config: Config) -> None:
+    """The loss along the way of gradient descent, a line for each step (paper, Fig. gm right)."""
+    method, k = DESCENT, config.frames[len(config.frames) // 2]
+
+    def draw(figure: Any) -> None:
+        from matplotlib import colormaps
+
+        relative = (
+            scores(journal, k, method, "drawn") / scores(journal, k, method, "start")[..., None]
+        )
+        panels = figure.subplots(1, 2, sharey=True)
+        for space, axes in zip(("raw", "whitened"), panels, strict=True):
+            chosen = [i for i, trial in enumerate(TRIALS[method]) if trial.space == space]
+            for number, i in enumerate(chosen):
+                axes.plot(
+                    sampled(config.iterations),
+                    relative[:, i].mean(axis=0),
+                    color=colormaps["viridis"](0.9 * number / (len(chosen) - 1)),
+                    dashes=[(), (4, 1.5), (1, 1.2)][number % 3],
+                    label=f"{TRIALS[method][i].step:g}",
+                )
+            axes.set(xscale="log", xlabel="iteration")
+            axes.set_title("steps in codes" if space == "raw" else "steps in whitened codes")
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.set_ylim(0.4, 1.4)
+            axes.legend(frameon=False, loc="lower left", ncols=2)
+            tidy(axes)
+        panels[0].set_ylabel(f"loss / start, {k} frames")
+
+    save_column(config.results / "step_size_curves", draw, height=2.6, width=PAGE)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
