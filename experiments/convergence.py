@@ -32,6 +32,7 @@ from jaxshape.results.figures import LINES, PAGE, PINK, RED, draw_mean, save_col
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
 from jaxshape.results.study import (
+    TUNED,
     Claim,
     Contestant,
     Scores,
@@ -47,10 +48,7 @@ RESULTS = Path(__file__).parent / "results"
 CHAIRS_AT_A_TIME = 8
 PAPER_CMA, PAPER_DESCENT = "CMA-ES, sigma0 2 in codes", "descent, step 0.14 in codes"
 
-SEARCHES: dict[str, tuple[str, RefineConfig]] = {
-    "CMA-ES": ("cma", RefineConfig()),
-    "gradient descent": ("gradient", RefineConfig()),
-    "Adam": ("gradient:adam", RefineConfig()),
+SEARCHES: dict[str, tuple[str, RefineConfig]] = TUNED | {
     PAPER_CMA: ("cma", RefineConfig(space="raw", sigma0=2.0)),
     PAPER_DESCENT: ("gradient", RefineConfig(space="raw", step_size=0.14)),
 }

@@ -261,6 +261,8 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
 def papers_step(journal: Journal, config: Config) -> Claim:
     method, trial = DESCENT, PAPERS[DESCENT]
     best = best_in(journal, config, method, "raw")
+    longest = max(one.step for one in TRIALS[method] if one.space == "raw")
+    edge = ", the longest tried" if best.step == longest else ""
     raw = [i for i, one in enumerate(TRIALS[method]) if one.space == "raw"]
     ending_above = np.max([overshoots(journal, k, method) for k in config.frames], axis=0)
     too_long = [TRIALS[method][i].step for i in raw if ending_above[i] > 0.1]
@@ -271,7 +273,7 @@ def papers_step(journal: Journal, config: Config) -> Claim:
         "Fig. gm right",
         "A step of 0.14 leads to fast convergence without overshooting",
         f"{percents(journal, config, method, trial)} of the best fall at {_listed(config.frames)}"
-        f" frames in {config.iterations} iterations; {text(best)} is the best. Steps that leave"
+        f" frames in {config.iterations} iterations; {text(best)}{edge} is best. Steps that leave"
         f" a tenth of the chairs above the start: {_listed(too_long) or 'none'}",
         "yes" if is_fast and is_kept else "not fast" if is_kept else "no",
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from jaxshape.files import atomic_path
 
@@ -33,7 +33,7 @@ LINES: dict[str, dict[str, Any]] = {
 """How the same thing is drawn in every figure."""
 
 
-def interval(samples: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "2 k"]:
+def interval(samples: Num[np.ndarray, "n k"]) -> Float[np.ndarray, "2 k"]:
     """The 95 % interval of the mean over the rows, by bootstrap over the rows.
 
     A single row has no spread: both ends are that row.

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Key, Num
 from rich.progress import Progress, TimeElapsedColumn
 
 from jaxshape.data.archives import list_meshes
@@ -221,12 +221,12 @@ class Claim(NamedTuple):
     """`yes`, `no`, or what of it does."""
 
 
-def mean_low_high(values: Float[np.ndarray, " n"]) -> list[float]:
+def mean_low_high(values: Num[np.ndarray, " n"]) -> list[float]:
     """The mean and the ends of its 95 % interval, as JSON has them."""
     return [_rounded(float(x)) for x in (values.mean(), *interval(values[:, None])[:, 0])]
 
 
-def mean_interval(values: Float[np.ndarray, " n"]) -> str:
+def mean_interval(values: Num[np.ndarray, " n"]) -> str:
     """The mean with its 95 % interval, as text: `+0.043 (0.040 to 0.047)`."""
     mean, low, high = mean_low_high(values)
     return f"{mean:+.3f} ({low:.3f} to {high:.3f})"

@@ -45,9 +45,7 @@ def test_smoke(name, linear_prior, tmp_path, monkeypatch):
         assert set(claim) == {"figure", "claim", "ours", "holds"} and all(claim.values())
         assert "nan" not in claim["ours"]
     with Image.open(tmp_path / f"{name}.png") as image:
-        assert (
-            image.size[0] >= 700 and len(set(image.convert("RGB").resize((50, 50)).getdata())) > 2
-        )
+        assert image.size[0] >= 700 and image.convert("L").getextrema()[0] < 128  # not blank
     assert "<svg" in (tmp_path / f"{name}.svg").read_text()
 
     before = (tmp_path / f"{name}.json").read_text()
