@@ -18,7 +18,7 @@ def test_the_readme_holds_the_table_of_the_results():
 def config(tmp_path):
     content = {"seconds": 100.0, "claims": [CLAIM], "rows": {"x": {"group": "CAD"}, "y": {}}}
     (tmp_path / "step_size.json").write_text(json.dumps(content))
-    (tmp_path / "README.md").write_text(f"before\n{BEGIN}old\n{END}after\n")
+    (tmp_path / "README.md").write_text(f"before\n{BEGIN}stale\n{END}after\n")
     return Config(results=tmp_path, readme=tmp_path / "README.md")
 
 
@@ -26,7 +26,7 @@ def test_only_the_table_is_replaced(config):
     main(config)
     text = config.readme.read_text()
     assert text.startswith("before\n" + BEGIN) and text.endswith(END + "after\n")
-    assert "old" not in text and r"a \| b" in text and "1 chairs, 2 min" in text
+    assert "stale" not in text and r"a \| b" in text and "1 chairs, 2 min" in text
     main(config)
     assert config.readme.read_text() == text
 
