@@ -92,21 +92,27 @@ def test_scores_are_those_of_an_evaluation(journal, test_set, linear_prior):
             assert ours["F"]["occluded_full"] == expected
 
 
-def test_a_run_goes_on_where_it_stopped(journal, test_set, linear_prior, tmp_path):
-    half = Journal(tmp_path / "study.json", {})
-    names = list(journal.rows)
-    half.add({name: journal.rows[name] for name in names[:3]}, 1.0)
-    seen = []
+def test_a_run_goes_on_where_it_stopped(meshes, linear_prior, tmp_path):
+    """With the chairs, and with the contestants, that were missing."""
+    journal, seen = Journal(tmp_path / "study.json", {}), []
 
-    def counting(keys, prior, case):
-        seen.append(len(keys))
-        return {"iou": jnp.zeros(len(keys))}
+    def constant(name):
+        def contest(keys, prior, case):
+            seen.append((name, len(keys)))
+            return {"iou": jnp.zeros(len(keys))}
 
-    compare({"counting": counting}, linear_prior, test_set, FRAMES, half)
-    assert seen == [2 * len(FRAMES)] and set(half.rows) == set(names)
-    assert half.rows[names[0]] == journal.rows[names[0]]
-    compare({"counting": counting}, linear_prior, test_set, FRAMES, half)
-    assert len(seen) == 1
+        return {name: contest}
+
+    few, all_of_them = TestSet(2, 1, meshes), TestSet(3, 2, meshes)
+    compare(constant("a"), linear_prior, few, FRAMES, journal)
+    compare(constant("a"), linear_prior, all_of_them, FRAMES, journal)
+    assert seen == [("a", 3 * len(FRAMES)), ("a", 2 * len(FRAMES))]
+    again = Journal(journal.path, {})
+    compare(constant("a") | constant("b"), linear_prior, all_of_them, FRAMES, again)
+    assert seen[2:] == [("b", 5 * len(FRAMES))]
+    compare(constant("a") | constant("b"), linear_prior, all_of_them, FRAMES, again)
+    assert len(seen) == 3 and set(again.rows) == {one.name for one in subjects(all_of_them)}
+    assert all(set(row["1"]) == {"a", "b"} for row in again.rows.values())
 
 
 def test_scores_may_be_curves(test_set, linear_prior, tmp_path):
