@@ -443,7 +443,9 @@ def plot(journal: Journal, config: Config) -> None:
             for axes, score in zip(row, ("iou", "objective"), strict=False):
                 axes.axhline(means(group, "CMA-ES", score)[0], color=GREY, linewidth=0.8)
                 axes.set(xscale="log", xlabel="decoder calls")
-                ticks = config.budgets[::2]
+                ticks = [
+                    k for k in config.budgets if config.budgets[-1] in (k, 4 * k, 16 * k, 64 * k)
+                ]
                 axes.set_xticks(ticks, [str(k) for k in ticks])
                 axes.minorticks_off()
             count = len(curve(journal, config, group, "CMA-ES", "iou"))
