@@ -39,6 +39,7 @@ from jaxshape.results.study import (
     TestSet,
     column,
     compare,
+    conclude,
     groups,
     mean_interval,
     mean_low_high,
@@ -101,12 +102,7 @@ def run(config: Config) -> Journal:
         journal,
         at_a_time=CHAIRS_AT_A_TIME,
     )
-    journal.write(
-        {
-            "claims": [claim._asdict() for claim in claims(journal, config)],
-            "summary": summary(journal, config),
-        }
-    )
+    conclude(journal, claims(journal, config), summary(journal, config))
     return journal
 
 

@@ -55,6 +55,7 @@ from jaxshape.results.study import (
     TestSet,
     column,
     compare,
+    conclude,
     groups,
     mean_interval,
 )
@@ -119,12 +120,7 @@ def run(config: Config) -> Journal:
         if name in config.searches
     }
     compare(contestants, prior, config.test, (config.frames,), journal, at_a_time=8)
-    journal.write(
-        {
-            "claims": [claim._asdict() for claim in claims(journal, config)],
-            "summary": summary(journal, config),
-        }
-    )
+    conclude(journal, claims(journal, config), summary(journal, config))
     return journal
 
 

@@ -44,7 +44,16 @@ from jaxshape.results.figures import PAGE, save_column
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
 from jaxshape.results.pictures import grid_panel, measurement_panel
-from jaxshape.results.study import TUNED, Claim, Subject, TestSet, compare, subjects, tuned
+from jaxshape.results.study import (
+    TUNED,
+    Claim,
+    Subject,
+    TestSet,
+    compare,
+    conclude,
+    subjects,
+    tuned,
+)
 
 RESULTS = Path(__file__).parent / "results"
 SHAPES = ("encoder", *TUNED)
@@ -98,11 +107,8 @@ def run(config: Config) -> Journal:
     journal = Journal(config.results / "gradient_failures.json", settings)
     search_long(chosen, prior, config, journal)
     shares = {str(k): wins(candidates, k) for k in config.frames}
-    journal.write(
-        {
-            "claims": [claim._asdict() for claim in claims(journal, shares, config)],
-            "summary": {"shares": shares, "cases": summary(journal)},
-        }
+    conclude(
+        journal, claims(journal, shares, config), {"shares": shares, "cases": summary(journal)}
     )
     return journal
 

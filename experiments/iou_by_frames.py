@@ -27,6 +27,7 @@ from jaxshape.results.study import (
     TestSet,
     column,
     compare,
+    conclude,
     groups,
     mean_interval,
     mean_low_high,
@@ -71,12 +72,7 @@ def run(config: Config) -> Journal:
     journal = Journal(config.results / "iou_by_frames.json", settings)
     contestants = tuned(prior, config.iterations) | {"F": measurement}
     compare(contestants, prior, config.test, config.frames, journal)
-    journal.write(
-        {
-            "claims": [claim._asdict() for claim in claims(journal, config)],
-            "summary": summary(journal, config),
-        }
-    )
+    conclude(journal, claims(journal, config), summary(journal, config))
     return journal
 
 

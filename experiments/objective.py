@@ -43,6 +43,7 @@ from jaxshape.results.study import (
     by_method,
     column,
     compare,
+    conclude,
     groups,
     mean_interval,
     mean_low_high,
@@ -134,12 +135,7 @@ def run(config: Config, residuals: dict[str, Residual] = RESIDUALS) -> tuple[Jou
     compare(contestants, prior, config.test, config.frames, clean)
     compare(robust, prior, config.test, config.frames, noisy, noise=True)
     noisy.write({"summary": summary(noisy, config)})
-    clean.write(
-        {
-            "claims": [claim._asdict() for claim in claims(clean, noisy, config)],
-            "summary": summary(clean, config),
-        }
-    )
+    conclude(clean, claims(clean, noisy, config), summary(clean, config))
     return clean, noisy
 
 

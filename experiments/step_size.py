@@ -34,7 +34,15 @@ from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import BLUE, GREEN, ORANGE, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
-from jaxshape.results.study import Claim, Contestant, Scores, TestSet, compare, mean_interval
+from jaxshape.results.study import (
+    Claim,
+    Contestant,
+    Scores,
+    TestSet,
+    compare,
+    conclude,
+    mean_interval,
+)
 
 RESULTS = Path(__file__).parent / "results"
 CASES_AT_A_TIME = 15
@@ -113,12 +121,7 @@ def run(config: Config) -> Journal:
         "CMA-ES": trying("CMA-ES", lambda step: (population, step), prior, search),
     }
     compare(contestants, prior, config.test, config.frames, journal, at_a_time=CASES_AT_A_TIME)
-    journal.write(
-        {
-            "claims": [claim._asdict() for claim in claims(journal, config)],
-            "summary": summary(journal, config),
-        }
-    )
+    conclude(journal, claims(journal, config), summary(journal, config))
     return journal
 
 

@@ -45,6 +45,7 @@ from jaxshape.results.study import (
     TestSet,
     column,
     compare,
+    conclude,
     groups,
     mean_interval,
     mean_low_high,
@@ -100,12 +101,7 @@ def run(config: Config) -> Journal:
     contestants["F"] = measured
     at_a_time = CHAIRS_AT_A_TIME * len(config.frames)
     compare(contestants, prior, chairs, config.frames, journal, at_a_time=at_a_time)
-    journal.write(
-        {
-            "claims": [claim._asdict() for claim in claims(journal, config)],
-            "summary": summary(journal, config),
-        }
-    )
+    conclude(journal, claims(journal, config), summary(journal, config))
     return journal
 
 

@@ -221,6 +221,11 @@ class Claim(NamedTuple):
     """`yes`, `no`, or what of it does."""
 
 
+def conclude(journal: Journal, claims: Iterable[Claim], summary: Any) -> None:
+    """Write what the rows say into the results file: the claims for the README, and a summary."""
+    journal.write({"claims": [claim._asdict() for claim in claims], "summary": summary})
+
+
 def mean_low_high(values: Num[np.ndarray, " n"]) -> list[float]:
     """The mean and the ends of its 95 % interval, as JSON has them."""
     return [_rounded(float(x)) for x in (values.mean(), *interval(values[:, None])[:, 0])]
