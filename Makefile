@@ -22,8 +22,8 @@ $(VENV)/.develop: $(VENV)/.runtime
 demo: $(VENV)/.runtime
 	$(BIN)/jaxshape demo
 
-# Every figure of the paper, and the README's table: 2 hours on two cores, the same again for each
-# halving of speed. Killed, it goes on where it stopped. The 78 CAD seats come from a Debian and an
+# Every figure of the paper, and the README's table: about two hours on two cores. Killed, it goes on
+# where it stopped. The 78 CAD seats come from a Debian and an
 # npm package (npm and dpkg-deb are needed); without a recording in KITCHEN, real_chair.py is left out.
 PAPER := convergence step_size iou_by_frames voluminous gallery gradient_failures equal_budget objective
 KITCHEN ?= kitchen/frames
