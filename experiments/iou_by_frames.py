@@ -177,9 +177,10 @@ def plot(journal: Journal, config: Config) -> None:
             axes.minorticks_off()
             tidy(axes)
         panels[0].set_ylabel("IoU")
-        panels[-1].legend(frameon=False, loc="lower right")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
 
-    save_column(config.results / "iou_by_frames", draw, height=2.8, width=PAGE)
+    save_column(config.results / "iou_by_frames", draw, height=3.1, width=PAGE)
 
 
 if __name__ == "__main__":
