@@ -3,12 +3,12 @@ r"""Where gradients stall and CMA-ES goes on, and the opposite cases (paper, Fig
     python experiments/gradient_failures.py --test.meshes cad_chairs/
 
 After 1, 4 and 8 frames, the chair on which CMA-ES leads plain descent most, by IoU, and the one on
-which it trails most (`--examples` for more): of all chairs where iou_by_frames.py has left its results in the same
-folder, else of 32 that are searched shortly here. Those few are then searched by plain descent,
-Adam and CMA-ES for the paper's 350 iterations, and every search goes on for as long from where
-every other one has ended. That tells a local minimum from a slow search: in a minimum nothing moves
-but what can leave it. The straight line between two ends is followed as well: where the objective
-never rises above both, no ridge parts them.
+which it trails most (`--examples` for more): of all chairs where iou_by_frames.py has left its
+results in the same folder, else of 32 that are searched shortly here. Those few are then searched by
+plain descent, Adam and CMA-ES for the paper's 350 iterations, and every search goes on for as long
+from where every other one has ended. That tells a local minimum from a slow search: in a minimum
+nothing moves but what can leave it. The straight line between two ends is followed as well: where
+the objective never rises above both, no ridge parts them.
 
 Chairs that were chosen as extremes show what can happen, not how often; that is in the shares of
 all chairs.
