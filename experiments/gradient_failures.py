@@ -4,7 +4,7 @@ r"""Where gradients stall and CMA-ES goes on, and the opposite cases (paper, Fig
 
 After 1, 4 and 8 frames, the chair on which CMA-ES leads plain descent most, by IoU, and the one on
 which it trails most (`--examples` for more): of all chairs where iou_by_frames.py has left its
-results in the same folder, else of 32 that are searched shortly here. Those few are then searched by
+results in the same folder, else of 32 that are searched shortly here. Those are then searched by
 plain descent, Adam and CMA-ES for the paper's 350 iterations, and every search goes on for as long
 from where every other one has ended. That tells a local minimum from a slow search: in a minimum
 nothing moves but what can leave it. The straight line between two ends is followed as well: where
