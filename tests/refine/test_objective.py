@@ -13,6 +13,8 @@ from hypothesis.extra.numpy import arrays
 
 from jaxshape.model.autoencoder import decode
 from jaxshape.refine import objective as module
+from jaxshape.refine.config import RefineConfig
+from jaxshape.refine.methods import build_refiner
 from jaxshape.refine.objective import (
     BALANCED,
     PAPER,
@@ -22,6 +24,7 @@ from jaxshape.refine.objective import (
     objective,
     target,
 )
+from jaxshape.refine.run import refine
 
 SHAPE = (4, 3, 5)
 rng = np.random.default_rng(0)
@@ -416,6 +419,17 @@ def test_memory_does_not_grow_with_objects_and_candidates(prior):
 
     few, many = largest(4, 256), largest(64, 1024)
     assert few == many < 64 * 1024 * 32**3
+
+
+def test_a_line_search_over_the_network_can_be_batched(prior):
+    """Its branches turn into selects, which copy whatever the network's program holds."""
+    keys, codes = jax.random.split(jax.random.key(0), 2), jnp.zeros((2, 10))
+    grids = jax.random.bernoulli(jax.random.key(1), 0.3, (2, 2, 32, 32, 32))
+    targets = target(*grids, jnp.zeros((2, 32, 32, 32)))
+    refiner = build_refiner("gradient:lbfgs", 10, RefineConfig())
+    search = partial(refine, refiner=refiner, iterations=2)
+    found = jax.eval_shape(search, keys, prior.params, codes, targets)
+    assert found.code.shape == codes.shape
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """From F and M to completed and composed grids."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,6 @@ from jaxshape.refine.objective import PAPER, cross_entropy, target
 from jaxshape.refine.reconstruction import (
     compose,
     fit_surface,
-    reconstruct,
     reconstruct_jit,
     refiner_for,
     require_measured,
@@ -207,11 +205,3 @@ def test_a_surface_that_the_space_holds_is_found_from_any_code(linear_prior, mon
     monkeypatch.setattr(reconstruction, "encode", lambda params, grid: jnp.zeros((2, 10)))
     fitted = jax.jit(fit_surface)(linear_prior, surface)
     assert (iou(fitted, surface) > 0.8).all()
-
-
-def test_a_line_search_over_the_network_can_be_batched(prior):
-    """Its branches turn into selects, which copy whatever the network's program holds."""
-    refiner = refiner_for("gradient:lbfgs", prior, CONFIG)
-    search = partial(reconstruct, refiner=refiner, config=CONFIG)
-    found = jax.eval_shape(search, KEYS, prior, OCCUPIED, OCCLUDED)
-    assert found.code.shape == (len(KEYS), 10)
