@@ -102,7 +102,7 @@ def run(config: Config) -> Journal:
         journal,
         at_a_time=CHAIRS_AT_A_TIME,
     )
-    conclude(journal, claims(journal, config), summary(journal, config))
+    conclude(journal, claims(journal, config), summary=summary(journal, config))
     return journal
 
 

@@ -120,7 +120,7 @@ def run(config: Config) -> Journal:
         if name in config.searches
     }
     compare(contestants, prior, config.test, (config.frames,), journal, at_a_time=8)
-    conclude(journal, claims(journal, config), summary(journal, config))
+    conclude(journal, claims(journal, config), summary=summary(journal, config))
     return journal
 
 
@@ -403,7 +403,7 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
             "IoU still rises while the lowest objective falls further",
             f"In the second half of the budget of {lowest}: objective {objective.mean():+.4f}, IoU"
             f" {mean_interval(gain)}, falling on {(gain < 0).sum()} of {len(gain)} chairs",
-            "yes" if interval(gain[:, None])[0, 0] > 0 else "not to speak of",
+            "yes" if interval(gain)[0] > 0 else "not to speak of",
         ),
     ]
 

@@ -35,7 +35,7 @@ from jaxshape.results.figures import BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, 
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
 from jaxshape.results.pictures import render_measurement, render_voxels
-from jaxshape.results.study import TUNED, Claim, Subject, TestSet, subjects
+from jaxshape.results.study import TUNED, Claim, Subject, TestSet, conclude, subjects
 
 RESULTS = Path(__file__).parent / "results"
 CREATORS = Path(__file__).with_name("cad_seats.json")
@@ -119,7 +119,7 @@ def run(config: Config) -> tuple[Journal, list[Shown]]:
         for (_, percentile), (chair, case, found) in zip(shown, rebuilt, strict=True)
     ]
     journal.add({one.chair.name: row(one) for one in shown}, time.perf_counter() - began)
-    journal.write({"claims": [claim._asdict() for claim in claims(journal, config)]})
+    conclude(journal, claims(journal, config))
     return journal, shown
 
 

@@ -107,9 +107,8 @@ def run(config: Config) -> Journal:
     journal = Journal(config.results / "gradient_failures.json", settings)
     search_long(chosen, prior, config, journal)
     shares = {str(k): wins(candidates, k) for k in config.frames}
-    conclude(
-        journal, claims(journal, shares, config), {"shares": shares, "cases": summary(journal)}
-    )
+    found = {"shares": shares, "cases": summary(journal)}
+    conclude(journal, claims(journal, shares, config), summary=found)
     return journal
 
 

@@ -135,7 +135,7 @@ def run(config: Config, residuals: dict[str, Residual] = RESIDUALS) -> tuple[Jou
     compare(contestants, prior, config.test, config.frames, clean)
     compare(robust, prior, config.test, config.frames, noisy, noise=True)
     noisy.write({"summary": summary(noisy, config)})
-    conclude(clean, claims(clean, noisy, config), summary(clean, config))
+    conclude(clean, claims(clean, noisy, config), summary=summary(clean, config))
     return clean, noisy
 
 
@@ -207,7 +207,7 @@ def claims(clean: Journal, noisy: Journal, config: Config) -> list[Claim]:
     def over_paper(journal: Journal) -> str:
         return mean_interval(overall(journal, config, DEFAULT) - overall(journal, config, PAPER))
 
-    paper = {k: interval(gain(clean, k, PAPER)[:, None])[:, 0] for k in config.frames}
+    paper = {k: interval(gain(clean, k, PAPER)) for k in config.frames}
     helped = np.mean([gain(clean, k, DEFAULT) for k in config.frames[1:]])
     printed = np.mean([gain(clean, k, PAPER) for k in config.frames[1:]])
     at = f"at {' / '.join(map(str, config.frames))} frames"
@@ -257,7 +257,7 @@ def plot(journals: dict[str, Journal], config: Config) -> None:
                 for i, name in enumerate(names[noise]):
                     for j, (k, color) in enumerate(zip(config.frames, colors, strict=False)):
                         values = gain(journal, k, name, score)
-                        low, high = interval(values[:, None])[:, 0]
+                        low, high = interval(values)
                         y = i + 0.24 * (1 - j)
                         axes.plot([low, high], [y, y], color=color, linewidth=1.4)
                         label = f"{k} frame{'s' * (k > 1)}" if i == 0 else None

@@ -41,7 +41,7 @@ from jaxshape.results.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.pictures import render_measurement, render_voxels
-from jaxshape.results.study import Claim
+from jaxshape.results.study import Claim, conclude
 from jaxshape.results.surface import surface
 
 RESULTS = Path(__file__).parent / "results"
@@ -134,7 +134,7 @@ def run(config: Config, recording: Recording) -> tuple[Journal, dict[str, Rebuil
         rebuilt[way] = _finished(moments, box)
         rows = {str(one.keyframes): agreement(one) for one in rebuilt[way].moments}
         journal.add({way: rows}, time.perf_counter() - began)
-    journal.write({"claims": [claim._asdict() for claim in claims(journal)]})
+    conclude(journal, claims(journal))
     return journal, rebuilt
 
 

@@ -31,7 +31,17 @@ from jaxshape.refine.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
 from jaxshape.refine.reconstruction import reconstruct, refiner_for
 from jaxshape.refine.refiner import Refiner
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import BLUE, GREEN, ORANGE, PAGE, draw_mean, save_column, tidy
+from jaxshape.results.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PAGE,
+    draw_mean,
+    save_column,
+    tidy,
+)
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
 from jaxshape.results.study import (
@@ -121,7 +131,7 @@ def run(config: Config) -> Journal:
         "CMA-ES": trying("CMA-ES", lambda step: (population, step), prior, search),
     }
     compare(contestants, prior, config.test, config.frames, journal, at_a_time=CASES_AT_A_TIME)
-    conclude(journal, claims(journal, config), summary(journal, config))
+    conclude(journal, claims(journal, config), summary=summary(journal, config))
     return journal
 
 
@@ -397,9 +407,9 @@ def plot(journal: Journal, config: Config) -> None:
             below.set(xscale="log", xlabel="sigma0" if method == "CMA-ES" else "step")
             above.set_title(method)
             for axes in (above, below):
-                axes.axvline(DEFAULTS[method].step, color="#8C949B", lw=0.8, zorder=0)
+                axes.axvline(DEFAULTS[method].step, color=GREY, lw=0.8, zorder=0)
                 if method in PAPERS:
-                    axes.axvline(PAPERS[method].step, color="#8C949B", lw=0.8, ls=":", zorder=0)
+                    axes.axvline(PAPERS[method].step, color=GREY, lw=0.8, ls=":", zorder=0)
                 tidy(axes)
             below.xaxis.set_major_formatter("{x:g}")
         upper[0].set_ylabel("objective / start")
@@ -408,9 +418,9 @@ def plot(journal: Journal, config: Config) -> None:
             lower[0].plot([], [], color=colors[k], marker=markers[k], ms=3, label=f"{k} frames")
         for space, dash in dashes.items():
             name = "codes" if space == "raw" else "whitened"
-            lower[0].plot([], [], color="#2B2F33", dashes=dash, label=name)
-        lower[1].plot([], [], color="#8C949B", lw=0.8, label="default")
-        lower[1].plot([], [], color="#8C949B", lw=0.8, ls=":", label="paper")
+            lower[0].plot([], [], color=INK, dashes=dash, label=name)
+        lower[1].plot([], [], color=GREY, lw=0.8, label="default")
+        lower[1].plot([], [], color=GREY, lw=0.8, ls=":", label="paper")
         figure.legend(frameon=False, loc="outside lower center", ncols=7)
 
     save_column(config.results / "step_size", draw, height=4.2, width=PAGE)

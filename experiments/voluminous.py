@@ -45,6 +45,7 @@ from jaxshape.results.study import (
     column,
     compare,
     conclude,
+    curves_by_frames,
     groups,
     mean_low_high,
     measurement,
@@ -99,7 +100,7 @@ def run(config: Config) -> Journal:
     contestants["F"] = measured
     at_a_time = CHAIRS_AT_A_TIME * len(config.frames)
     compare(contestants, prior, chairs, config.frames, journal, at_a_time=at_a_time)
-    conclude(journal, claims(journal, config), summary(journal, config))
+    conclude(journal, claims(journal, config), summary=summary(journal, config))
     return journal
 
 
@@ -176,18 +177,9 @@ def summary(journal: Journal, config: Config) -> dict[str, Any]:
             for name, curve in curves.items()
         }
         for group in groups(journal)
-        for curves in (_curves(journal, config, group) | _inside(journal, config, group),)
-    }
-
-
-def _curves(journal: Journal, config: Config, group: str) -> dict[str, list[np.ndarray]]:
-    def of(contestant: str, score: str = "iou") -> list[np.ndarray]:
-        return [column(journal, group, k, contestant, score) for k in config.frames]
-
-    return {name: of(name) for name in METHODS} | {
-        "CMA-ES, composed": of("CMA-ES", "iou_composed"),
-        "F, occluded empty": of("F", "occluded_empty"),
-        "F, occluded full": of("F", "occluded_full"),
+        for curves in (
+            curves_by_frames(journal, group, config.frames) | _inside(journal, config, group),
+        )
     }
 
 
@@ -208,7 +200,7 @@ def _inside(journal: Journal, config: Config, group: str) -> dict[str, list[np.n
 def claims(journal: Journal, config: Config) -> list[Claim]:
     """What the paper says of voluminous chairs, what is found, and what lies behind it."""
     found = groups(journal)
-    curves = {group: _curves(journal, config, group) for group in found}
+    curves = {group: curves_by_frames(journal, group, config.frames) for group in found}
     inside = {group: _inside(journal, config, group) for group in found}
 
     def ahead(group: str, shape: str) -> list[np.ndarray]:
@@ -281,7 +273,7 @@ def plot(journal: Journal, config: Config) -> None:
     def draw(figure: Any) -> None:
         panels = figure.subplots(1, len(groups(journal)), sharey=True, squeeze=False)[0]
         for axes, group in zip(panels, groups(journal), strict=True):
-            curves = _curves(journal, config, group)
+            curves = curves_by_frames(journal, group, config.frames)
             for name, curve in curves.items():
                 draw_mean(axes, config.frames, np.stack(curve, axis=1), label=name, **LINES[name])
             title = f"{len(curve[0])} voluminous {group} chairs"

@@ -33,7 +33,7 @@ LINES: dict[str, dict[str, Any]] = {
 """How the same thing is drawn in every figure."""
 
 
-def interval(samples: Num[np.ndarray, "n k"]) -> Float[np.ndarray, "2 k"]:
+def interval(samples: Num[np.ndarray, "n ..."]) -> Float[np.ndarray, "2 ..."]:
     """The 95 % interval of the mean over the rows, by bootstrap over the rows.
 
     A single row has no spread: both ends are that row.

@@ -221,14 +221,14 @@ class Claim(NamedTuple):
     """`yes`, `no`, or what of it does."""
 
 
-def conclude(journal: Journal, claims: Iterable[Claim], summary: Any) -> None:
-    """Write what the rows say into the results file: the claims for the README, and a summary."""
-    journal.write({"claims": [claim._asdict() for claim in claims], "summary": summary})
+def conclude(journal: Journal, claims: Iterable[Claim], **findings: Any) -> None:
+    """Write what the rows say into the results file: the claims for the README, and more."""
+    journal.write({"claims": [claim._asdict() for claim in claims]} | findings)
 
 
 def mean_low_high(values: Num[np.ndarray, " n"]) -> list[float]:
     """The mean and the ends of its 95 % interval, as JSON has them."""
-    return [_rounded(float(x)) for x in (values.mean(), *interval(values[:, None])[:, 0])]
+    return [_rounded(float(x)) for x in (values.mean(), *interval(values))]
 
 
 def mean_interval(values: Num[np.ndarray, " n"]) -> str:
@@ -241,6 +241,21 @@ def column(journal: Journal, group: str, frames: int, contestant: str, score: st
     """One score of one contestant over all chairs of a group, in the order of the rows."""
     rows = [row for row in journal.rows.values() if row["group"] == group]
     return np.array([row[str(frames)][contestant][score] for row in rows])
+
+
+def curves_by_frames(
+    journal: Journal, group: str, frames: Sequence[int]
+) -> dict[str, list[np.ndarray]]:
+    """IoU of the encoder, the `TUNED` searches, composed, and F: an array for each number."""
+
+    def of(contestant: str, score: str = "iou") -> list[np.ndarray]:
+        return [column(journal, group, k, contestant, score) for k in frames]
+
+    return {name: of(name) for name in ("encoder", *TUNED)} | {
+        "CMA-ES, composed": of("CMA-ES", "iou_composed"),
+        "F, occluded empty": of("F", "occluded_empty"),
+        "F, occluded full": of("F", "occluded_full"),
+    }
 
 
 def groups(journal: Journal) -> list[str]:
