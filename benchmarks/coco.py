@@ -38,9 +38,9 @@ from matplotlib.figure import Figure
 from scipy.stats import fisher_exact
 
 from jaxshape.files import atomic_path
-from jaxshape.refine.batching import select
-from jaxshape.refine.refiner import StopReason
-from jaxshape.refine.restarts import with_restarts
+from jaxshape.search.batching import select
+from jaxshape.search.refiner import StopReason
+from jaxshape.search.restarts import with_restarts
 
 TARGETS = np.logspace(2, -8, 51)
 """Distances to the lowest value; the last one counts as solved."""

@@ -18,7 +18,7 @@ from benchmarks.harness import Metric, alternate, compiled, difference, fastest,
 from benchmarks.problems import PRECISIONS, Problem
 from jaxshape.model.autoencoder import architecture_of
 from jaxshape.model.config import Architecture
-from jaxshape.refine.config import Precision
+from jaxshape.search.config import Precision
 
 POPULATIONS = (17, 64, 256)
 TARGETS = {"float32": 1.3, "bfloat16": 1.0}

@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, Key
 import jaxshape as js
 from jaxshape.data.capture import camera_distance
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.config import Precision
-from jaxshape.refine.objective import Target
-from jaxshape.refine.run import Refined
-from jaxshape.refine.space import whitened
+from jaxshape.search.config import Precision
+from jaxshape.search.objective import Target
+from jaxshape.search.run import Refined
+from jaxshape.search.space import whitened
 
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
 

@@ -14,7 +14,7 @@ from benchmarks import problems
 from benchmarks.decode import torch_scores
 from benchmarks.harness import Metric, alternate, compiled, fastest, optional, speedup
 from benchmarks.problems import Problem
-from jaxshape.refine.run import Refined
+from jaxshape.search.run import Refined
 
 POPULATION = 17
 SIGMA0 = 0.1

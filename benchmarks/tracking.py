@@ -23,8 +23,8 @@ from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.incremental import Step, build_mapper
 from jaxshape.mapping.keyframes import Shot
 from jaxshape.mapping.views import View, view_of
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import refiner_for
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import refiner_for
 
 WIDTH, HEIGHT = 320, 240
 FIELD_OF_VIEW = 57.0

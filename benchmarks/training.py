@@ -9,7 +9,7 @@ from benchmarks.harness import Metric, alternate, compiled, difference, fastest,
 from benchmarks.problems import PRECISIONS
 from jaxshape.model.config import TrainConfig
 from jaxshape.model.training import initial_state, train_step
-from jaxshape.refine.config import Precision
+from jaxshape.search.config import Precision
 
 BATCH = 32
 LIMITS = {"float32": 1e-5, "bfloat16": 3e-3}

@@ -25,8 +25,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import reconstruct, refiner_for
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import LINES, PAGE, PINK, RED, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
@@ -44,6 +42,8 @@ from jaxshape.results.study import (
     mean_interval,
     mean_low_high,
 )
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import reconstruct, refiner_for
 
 RESULTS = Path(__file__).parent / "results"
 CHAIRS_AT_A_TIME = 8

@@ -28,11 +28,6 @@ from scipy.stats import spearmanr
 
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods import build_refiner
-from jaxshape.refine.methods.hybrid import POLISH, polished
-from jaxshape.refine.reconstruction import reconstruct
-from jaxshape.refine.refiner import Refiner, StopReason
 from jaxshape.results.figures import (
     BLUE,
     GREY,
@@ -59,6 +54,11 @@ from jaxshape.results.study import (
     groups,
     mean_interval,
 )
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.methods.hybrid import POLISH, polished
+from jaxshape.search.reconstruction import reconstruct
+from jaxshape.search.refiner import Refiner, StopReason
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -36,9 +36,6 @@ from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.objective import cross_entropy, target
-from jaxshape.refine.reconstruction import reconstruct, refiner_for
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
 from jaxshape.results.figures import PAGE, save_column
 from jaxshape.results.journal import Journal
@@ -54,6 +51,9 @@ from jaxshape.results.study import (
     subjects,
     tuned,
 )
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.objective import cross_entropy, target
+from jaxshape.search.reconstruction import reconstruct, refiner_for
 
 RESULTS = Path(__file__).parent / "results"
 SHAPES = ("encoder", *TUNED)

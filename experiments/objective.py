@@ -27,11 +27,6 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods import build_refiner
-from jaxshape.refine.objective import Weights, target
-from jaxshape.refine.reconstruction import compose, search_space, unlikeliness
-from jaxshape.refine.run import refine
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import BLUE, GREY, INK, ORANGE, PAGE, interval, save_column, tidy
 from jaxshape.results.journal import Journal
@@ -48,6 +43,11 @@ from jaxshape.results.study import (
     mean_interval,
     mean_low_high,
 )
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.objective import Weights, target
+from jaxshape.search.reconstruction import compose, search_space, unlikeliness
+from jaxshape.search.run import refine
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -26,10 +26,6 @@ from jaxtyping import Array
 
 from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
-from jaxshape.refine.reconstruction import reconstruct, refiner_for
-from jaxshape.refine.refiner import Refiner
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import (
     BLUE,
@@ -53,6 +49,10 @@ from jaxshape.results.study import (
     conclude,
     mean_interval,
 )
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
+from jaxshape.search.reconstruction import reconstruct, refiner_for
+from jaxshape.search.refiner import Refiner
 
 RESULTS = Path(__file__).parent / "results"
 CASES_AT_A_TIME = 15

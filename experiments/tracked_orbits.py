@@ -44,9 +44,9 @@ from jaxshape.mapping.keyframes import Shot
 from jaxshape.mapping.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import refiner_for
 from jaxshape.results.metrics import iou
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import refiner_for
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -28,7 +28,7 @@ Data moves one way, and so do imports:
     geometry   cameras, voxel frames, fusion of frames into F and M
     data       meshes, procedural chairs, virtual depth camera, training pairs, RGB-D recordings
     model      convolutions, auto-encoder, weights, training
-    refine     objective (Eq. 7), refiners, the batched search, composed shapes
+    search     objective (Eq. 7), refiners, the batched search, composed shapes
     mapping    segmentation, the object's frame, ICP, keyframes, realignment of a recording
     results    surfaces, metrics, evaluation, pictures, files, report and live view
     cli        the `jaxshape` command

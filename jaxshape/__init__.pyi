@@ -15,28 +15,28 @@ from .mapping.segmentation import Prompt, Segmentation, segment
 from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
 from .model.config import Architecture
 from .model.weights import ShapePrior, load_prior, save_prior
-from .refine.cma import cma
-from .refine.config import RefineConfig
-from .refine.methods import build_refiner
-from .refine.methods.evosax import evosax_strategy
-from .refine.methods.gradient import gradient
-from .refine.methods.hybrid import polished
-from .refine.objective import Target, Weights, objective, target
-from .refine.reconstruction import (
+from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
+from .results.report import write_report
+from .results.surface import surface, write_mesh
+from .search.cma import cma
+from .search.config import RefineConfig
+from .search.methods import build_refiner
+from .search.methods.evosax import evosax_strategy
+from .search.methods.gradient import gradient
+from .search.methods.hybrid import polished
+from .search.objective import Target, Weights, objective, target
+from .search.reconstruction import (
     Reconstruction,
     compose,
     fit_surface,
     reconstruct,
     refiner_for,
 )
-from .refine.refiner import Distribution, Refiner, StopReason, Trace
-from .refine.restarts import with_restarts
-from .refine.run import Refined, refine
-from .refine.space import LatentSpace, raw, whitened
-from .refine.stopping import Tolerances
-from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
-from .results.report import write_report
-from .results.surface import surface, write_mesh
+from .search.refiner import Distribution, Refiner, StopReason, Trace
+from .search.restarts import with_restarts
+from .search.run import Refined, refine
+from .search.space import LatentSpace, raw, whitened
+from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",

@@ -21,9 +21,9 @@ from jaxshape.mapping.segmentation import Prompt
 from jaxshape.model.autoencoder import initialize
 from jaxshape.model.config import Architecture
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine import objective, reconstruction, run
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import refiner_for
+from jaxshape.search import objective, reconstruction, run
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import refiner_for
 
 # The same examples each time, without deadlines: what fails, fails for the change that broke it.
 settings.load_profile("ci")

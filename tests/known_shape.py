@@ -15,7 +15,7 @@ from jaxshape.data.meshes import sample_surface
 from jaxshape.geometry import grid
 from jaxshape.model import weights
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine import objective, reconstruction, run
+from jaxshape.search import objective, reconstruction, run
 
 CODE = 6
 

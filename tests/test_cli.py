@@ -28,10 +28,10 @@ from jaxshape.mapping.segmentation import Prompt
 from jaxshape.model import training, weights
 from jaxshape.model.config import PRESETS
 from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prior
-from jaxshape.refine.methods import families
 from jaxshape.results import evaluation
 from jaxshape.results.plots import plot_search
 from jaxshape.results.traces import read_search
+from jaxshape.search.methods import families
 
 COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
 

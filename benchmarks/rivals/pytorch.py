@@ -126,7 +126,7 @@ def fold(decoder: Decoder) -> Decoder:
 def cross_entropy(
     logits: torch.Tensor, occupied: torch.Tensor, empty: torch.Tensor
 ) -> torch.Tensor:
-    """Eq. 7 of every candidate, from the two weights of `jaxshape.refine.objective.Target`."""
+    """Eq. 7 of every candidate, from the two weights of `jaxshape.search.objective.Target`."""
     total = (occupied + empty) * F.softplus(logits) - occupied * logits
     return total.mean((-3, -2, -1))
 

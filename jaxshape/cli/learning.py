@@ -18,7 +18,7 @@ from jaxshape.cli.scoring import load_models, score
 from jaxshape.data.config import DatasetConfig
 from jaxshape.files import atomic_path
 from jaxshape.model.config import PRESETS, TrainConfig
-from jaxshape.refine.config import RefineConfig
+from jaxshape.search.config import RefineConfig
 
 PROCESSORS = os.cpu_count() or 1
 

@@ -9,7 +9,7 @@ from jaxshape.cli.common import require
 from jaxshape.data.config import Axis, DatasetConfig
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.model.config import TrainConfig
-from jaxshape.refine.config import RefineConfig
+from jaxshape.search.config import RefineConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,12 +10,12 @@ import tyro
 
 from jaxshape.cli.common import console, require
 from jaxshape.cli.options import checked_search
-from jaxshape.refine.config import RefineConfig
+from jaxshape.search.config import RefineConfig
 
 # Found as files: importing the package of the methods would import JAX.
 METHODS = ", ".join(
     family.name
-    for family in pkgutil.iter_modules([str(Path(__file__).parents[1] / "refine/methods")])
+    for family in pkgutil.iter_modules([str(Path(__file__).parents[1] / "search/methods")])
 )
 VARIANTS = "cma:ipop, cma:bipop, gradient:OPTIMISER of optax, evosax:STRATEGY, hybrid:OPTIMISER"
 
@@ -41,7 +41,7 @@ class Rebuild:
     def prepare(self) -> tuple[Any, Any, RefineConfig]:
         """The prior, the search and its settings, so that bad options are refused before work."""
         from jaxshape.model.weights import load_prior
-        from jaxshape.refine.reconstruction import refiner_for
+        from jaxshape.search.reconstruction import refiner_for
 
         config, prior = checked_search(self.search), load_prior(self.weights)
         return prior, refiner_for(self.method, prior, config), config
@@ -85,9 +85,9 @@ class Demo(Rebuild):
         from jaxshape.data.chairs import random_chair
         from jaxshape.data.dataset import TEST_SEEDS
         from jaxshape.geometry import camera, fusion
-        from jaxshape.refine.reconstruction import reconstruct_jit, require_measured
         from jaxshape.results.output import Observation, write_result
         from jaxshape.results.report import write_report
+        from jaxshape.search.reconstruction import reconstruct_jit, require_measured
 
         require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
         require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")

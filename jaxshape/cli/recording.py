@@ -67,7 +67,6 @@ class Reconstruct(Rebuild):
         from jaxshape.mapping.recording import follow
         from jaxshape.mapping.segmentation import Prompt, check_prompt
         from jaxshape.model.weights import fingerprint
-        from jaxshape.refine.reconstruction import require_measured
         from jaxshape.results.progress import (
             load_state,
             observation_of,
@@ -75,6 +74,7 @@ class Reconstruct(Rebuild):
             save_state,
             write_progress,
         )
+        from jaxshape.search.reconstruction import require_measured
 
         require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
         require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")

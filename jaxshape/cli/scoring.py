@@ -16,7 +16,7 @@ from tyro.conf import Positional
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, checked_numbers, checked_search
 from jaxshape.files import atomic_path
-from jaxshape.refine.config import RefineConfig
+from jaxshape.search.config import RefineConfig
 
 
 @dataclass(frozen=True)

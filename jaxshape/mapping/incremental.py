@@ -51,9 +51,9 @@ from jaxshape.mapping.state import (
     with_surface,
 )
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import Reconstruction, reconstruct_jit
-from jaxshape.refine.refiner import Refiner
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import Reconstruction, reconstruct_jit
+from jaxshape.search.refiner import Refiner
 
 _JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess of the motion
 

@@ -31,9 +31,9 @@ from jaxshape.geometry.grid import MARGIN, RESOLUTION
 from jaxshape.mapping.sight import Sight
 from jaxshape.model.autoencoder import decode, encode, prepare_decoder
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.batching import select
-from jaxshape.refine.refiner import finite_or_inf
-from jaxshape.refine.space import whitened
+from jaxshape.search.batching import select
+from jaxshape.search.refiner import finite_or_inf
+from jaxshape.search.space import whitened
 
 
 @dataclass(frozen=True)

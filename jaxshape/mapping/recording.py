@@ -28,7 +28,7 @@ from jaxshape.mapping.keyframes import Keyframe, as_pose, prepare, resized
 from jaxshape.mapping.segmentation import segment_inside
 from jaxshape.mapping.state import State
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.reconstruction import Reconstruction
+from jaxshape.search.reconstruction import Reconstruction
 
 PLACE_AGAIN = (2, 3, 5, 8, 13)
 """Numbers of keyframes after which the object is placed anew."""

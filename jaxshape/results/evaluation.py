@@ -17,15 +17,15 @@ from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import (
+from jaxshape.results.metrics import bounds, iou, shape_scores
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import (
     Reconstruction,
     all_measured,
     fit_surface,
     reconstruct,
     refiner_for,
 )
-from jaxshape.results.metrics import bounds, iou, shape_scores
 
 OBJECTS_AT_A_TIME = 16
 """Objects refined together: enough to fill a machine, few enough to show progress."""
@@ -38,7 +38,7 @@ class EvaluateConfig:
     frames: tuple[int, ...] = (1, 4, 8, 18)
     """Numbers of frames to fuse: the first k of the orbit."""
     methods: tuple[str, ...] = ("encoder", "gradient", "cma")
-    """By name, see `jaxshape.refine.methods`; "encoder" searches nothing."""
+    """By name, see `jaxshape.search.methods`; "encoder" searches nothing."""
     noise: bool = False
     """Add the faults of a real sensor to the depth images."""
     ceiling: bool = False

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxshape.refine.refiner import Distribution, Trace
 from jaxshape.results.figures import BLUE, CYCLE, GREEN, INK, ORANGE, save_figure, tidy
 from jaxshape.results.traces import Search, restarts
+from jaxshape.search.refiner import Distribution, Trace
 
 SUFFIXES = (".png", ".svg", ".pdf")
 

@@ -20,12 +20,12 @@ from jaxshape.data.archives import list_meshes
 from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
 from jaxshape.data.meshes import Skipped
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import Reconstruction, reconstruct, refiner_for
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
 from jaxshape.results.figures import interval
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds, iou
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import Reconstruction, reconstruct, refiner_for
 
 CASES_AT_A_TIME = 64
 """Cases searched together, unless a chair has more: the rows between two entries of the journal."""
@@ -82,7 +82,7 @@ def _mix(subject: Any) -> int:
 
 
 def by_method(method: str, prior: ShapePrior, config: RefineConfig) -> Contestant:
-    """The contestant that rebuilds by a method of `jaxshape.refine.methods`, or `encoder`."""
+    """The contestant that rebuilds by a method of `jaxshape.search.methods`, or `encoder`."""
     refiner = refiner_for(method, prior, config)
 
     def contest(keys, prior, case):

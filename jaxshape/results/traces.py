@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxshape.files import atomic_path
-from jaxshape.refine.refiner import Distribution, Trace
+from jaxshape.search.refiner import Distribution, Trace
 
 
 class TraceError(ValueError):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from jaxshape.refine import reconstruction
+from jaxshape.search import reconstruction
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 SCRIPTS = [

@@ -13,8 +13,8 @@ from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.incremental import build_mapper
 from jaxshape.mapping.keyframes import Shot
 from jaxshape.mapping.views import view_of
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import refiner_for
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import refiner_for
 
 LENS = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
 FURNITURE = (FLOOR, WALLS, CHAIR, TABLE, CRATE)

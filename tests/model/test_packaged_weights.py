@@ -14,9 +14,9 @@ from jaxshape.geometry import camera, fusion
 from jaxshape.model.autoencoder import architecture_of, decode, encode
 from jaxshape.model.config import Architecture
 from jaxshape.model.weights import load_card, load_prior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.reconstruction import reconstruct, refiner_for
 from jaxshape.results.metrics import iou
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import reconstruct, refiner_for
 
 FRAMES = 6
 CHAIRS = 4

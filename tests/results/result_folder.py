@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 from jaxshape.geometry.grid import GridFrame
-from jaxshape.refine.reconstruction import Reconstruction, compose
-from jaxshape.refine.refiner import StopReason, Trace
 from jaxshape.results import output
 from jaxshape.results.output import Observation, write_result
+from jaxshape.search.reconstruction import Reconstruction, compose
+from jaxshape.search.refiner import StopReason, Trace
 
 T_WORLD_OBJECT = np.array([[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]], float)
 T_OBJECT_CAMERA = np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2], [0, 0, 0, 1]], float)

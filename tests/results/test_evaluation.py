@@ -11,7 +11,6 @@ import trimesh
 
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.meshes import Model
-from jaxshape.refine.config import RefineConfig
 from jaxshape.results import evaluation
 from jaxshape.results.evaluation import (
     EvaluateConfig,
@@ -24,6 +23,7 @@ from jaxshape.results.evaluation import (
     write_journal,
 )
 from jaxshape.results.metrics import bounds, iou
+from jaxshape.search.config import RefineConfig
 
 CONFIG = EvaluateConfig((1, 2), refine=RefineConfig(iterations=2, population=4), seed=3)
 SCORES = {"iou", "iou_composed", "chamfer_l1", "f_score", "objective"}

@@ -8,10 +8,10 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxshape.refine.refiner import Distribution, Trace
 from jaxshape.results import plots
 from jaxshape.results.plots import compare_searches, convergence, plot_search
 from jaxshape.results.traces import Search
+from jaxshape.search.refiner import Distribution, Trace
 
 N, DIM = 20, 4
 EVALUATIONS = 1 + 8 * np.arange(1, N + 1)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from jaxshape.data.chairs import random_chair
-from jaxshape.refine.config import RefineConfig
 from jaxshape.results.evaluation import EvaluateConfig, evaluate
 from jaxshape.results.journal import Journal
 from jaxshape.results.study import (
@@ -21,6 +20,7 @@ from jaxshape.results.study import (
     measurement,
     subjects,
 )
+from jaxshape.search.config import RefineConfig
 
 FRAMES = (1, 2)
 SEARCH = RefineConfig(iterations=2, population=4)

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.refine.refiner import Distribution, Trace
-from jaxshape.refine.restarts import with_restarts
-from jaxshape.refine.stopping import Tolerances
 from jaxshape.results.traces import TraceError, read_search, read_trace, restarts, write_trace
+from jaxshape.search.refiner import Distribution, Trace
+from jaxshape.search.restarts import with_restarts
+from jaxshape.search.stopping import Tolerances
 
 
 def make_trace(iterations=7, dim=3):

@@ -1,10 +1,10 @@
 """CMA-ES, with the variants `cma:ipop` and `cma:bipop` that restart."""
 
-from jaxshape.refine.cma import cma
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.refiner import Refiner
-from jaxshape.refine.restarts import with_restarts
-from jaxshape.refine.stopping import Tolerances
+from jaxshape.search.cma import cma
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.refiner import Refiner
+from jaxshape.search.restarts import with_restarts
+from jaxshape.search.stopping import Tolerances
 
 
 def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.space import fold, raw, whitened
+from jaxshape.search.space import fold, raw, whitened
 
 BOUND = 2.0
 SQUARE = jnp.array([[2.0, 0.0, 0.0], [1.0, 0.5, 0.0], [-1.0, 0.3, 0.1]])

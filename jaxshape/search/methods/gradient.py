@@ -9,9 +9,9 @@ import optax
 import optax.tree_utils
 from jaxtyping import Array, Float, Int
 
-from jaxshape.refine.batching import select
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.refiner import (
+from jaxshape.search.batching import select
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.refiner import (
     Candidate,
     Objective,
     Refiner,

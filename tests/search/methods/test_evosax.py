@@ -7,7 +7,7 @@ import optax
 import pytest
 from problems import run_batch, sphere
 
-from jaxshape.refine.methods.evosax import evosax_strategy
+from jaxshape.search.methods.evosax import evosax_strategy
 
 KEY = jax.random.key(0)
 pytestmark = pytest.mark.usefixtures("compile_quickly")

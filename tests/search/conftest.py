@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxshape.refine import objective as objective_module
-from jaxshape.refine import run as run_module
+from jaxshape.search import objective as objective_module
+from jaxshape.search import run as run_module
 
 
 class CountedDecoder:

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.refine.batching import apply_if
-from jaxshape.refine.refiner import StopReason, finite_or_inf
+from jaxshape.search.batching import apply_if
+from jaxshape.search.refiner import StopReason, finite_or_inf
 
 RECORD_EVERY = 5
 """Generations between entries of the long history."""

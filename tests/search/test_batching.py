@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.refine.batching import apply_if
+from jaxshape.search.batching import apply_if
 
 calls = []
 

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.refine.batching import select
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods import build_refiner
-from jaxshape.refine.refiner import Candidate, Objective, Refiner, StopReason, Trace
+from jaxshape.search.batching import select
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.refiner import Candidate, Objective, Refiner, StopReason, Trace
 
 POLISH = 0.2
 """Share of the iterations that are left to the gradient."""

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
-from jaxshape.refine import reconstruction
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.objective import PAPER, cross_entropy, target
-from jaxshape.refine.reconstruction import (
+from jaxshape.results.metrics import iou
+from jaxshape.search import reconstruction
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.objective import PAPER, cross_entropy, target
+from jaxshape.search.reconstruction import (
     compose,
     fit_surface,
     reconstruct_jit,
@@ -21,8 +22,7 @@ from jaxshape.refine.reconstruction import (
     search_space,
     unlikeliness,
 )
-from jaxshape.refine.refiner import StopReason
-from jaxshape.results.metrics import iou
+from jaxshape.search.refiner import StopReason
 
 KEY = jax.random.key(0)
 KEYS = jax.random.split(KEY, 2)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from problems import run_batch, sphere
 
-from jaxshape.refine import methods
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods import build_refiner, families
-from jaxshape.refine.refiner import StopReason
+from jaxshape.search import methods
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner, families
+from jaxshape.search.refiner import StopReason
 
 KEY = jax.random.key(0)
 POINTS = jnp.stack([jnp.full(3, 2.0), jnp.linspace(-1, 1, 3)])
@@ -66,7 +66,7 @@ def recipe(tmp_path, monkeypatch):
     """The example put where it says it belongs, next to the searches of the package."""
     text = (Path(__file__).parents[3] / "CONTRIBUTING.md").read_text()
     section = text.split("## How to add a refiner")[1].split("\n## ")[0]
-    (name,) = re.findall(r"jaxshape/refine/methods/(\w+)\.py", section)
+    (name,) = re.findall(r"jaxshape/search/methods/(\w+)\.py", section)
     (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
     (tmp_path / f"{name}.py").write_text(code)
     monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(tmp_path)])

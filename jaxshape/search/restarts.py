@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.refine import cma, stopping
-from jaxshape.refine.batching import apply_if, select
-from jaxshape.refine.refiner import (
+from jaxshape.search import cma, stopping
+from jaxshape.search.batching import apply_if, select
+from jaxshape.search.refiner import (
     Candidate,
     Objective,
     Refiner,
@@ -29,7 +29,7 @@ from jaxshape.refine.refiner import (
     keep_better,
     summarise,
 )
-from jaxshape.refine.stopping import Tolerances
+from jaxshape.search.stopping import Tolerances
 
 
 class Run(NamedTuple):

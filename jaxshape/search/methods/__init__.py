@@ -8,8 +8,8 @@ is all: the module's name is the method's name everywhere, the command line incl
 import importlib
 import pkgutil
 
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.refiner import Refiner
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.refiner import Refiner
 
 
 def families() -> list[str]:

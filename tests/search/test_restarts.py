@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from problems import quick_compilation, rastrigin, sphere  # noqa: F401
 
-from jaxshape.refine.cma import constants, tell
-from jaxshape.refine.refiner import StopReason
-from jaxshape.refine.restarts import with_restarts
+from jaxshape.search.cma import constants, tell
+from jaxshape.search.refiner import StopReason
+from jaxshape.search.restarts import with_restarts
 
 KEY = jax.random.key(0)
 DIM, SIZE, DOUBLINGS = 5, 8, 4

@@ -17,10 +17,10 @@ from problems import (  # noqa: F401
     sphere,
 )
 
-from jaxshape.refine import stopping
-from jaxshape.refine.cma import cma, constants, start, tell
-from jaxshape.refine.refiner import Candidate, StopReason
-from jaxshape.refine.stopping import Tolerances
+from jaxshape.search import stopping
+from jaxshape.search.cma import cma, constants, start, tell
+from jaxshape.search.refiner import Candidate, StopReason
+from jaxshape.search.stopping import Tolerances
 
 KEY = jax.random.key(0)
 # --- against pycma ----------------------------------------------------------------------------

@@ -7,11 +7,11 @@ import optax
 import pytest
 from problems import ellipsoid, run_batch, sphere
 
-from jaxshape.refine.cma import cma
-from jaxshape.refine.methods.gradient import gradient
-from jaxshape.refine.methods.hybrid import polished
-from jaxshape.refine.refiner import StopReason
-from jaxshape.refine.stopping import Tolerances
+from jaxshape.search.cma import cma
+from jaxshape.search.methods.gradient import gradient
+from jaxshape.search.methods.hybrid import polished
+from jaxshape.search.refiner import StopReason
+from jaxshape.search.stopping import Tolerances
 
 KEY = jax.random.key(0)
 POINTS = jnp.stack([jnp.full(5, 2.0), jnp.linspace(-1, 1, 5)])

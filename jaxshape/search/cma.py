@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxshape.refine import stopping
-from jaxshape.refine.batching import apply_if
-from jaxshape.refine.refiner import (
+from jaxshape.search import stopping
+from jaxshape.search.batching import apply_if
+from jaxshape.search.refiner import (
     Candidate,
     Distribution,
     Objective,
@@ -27,7 +27,7 @@ from jaxshape.refine.refiner import (
     start_trace,
     summarise,
 )
-from jaxshape.refine.stopping import History, Tolerances
+from jaxshape.search.stopping import History, Tolerances
 
 
 class Constants(NamedTuple):

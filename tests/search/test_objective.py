@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from jaxshape.model.autoencoder import decode
-from jaxshape.refine import objective as module
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods import build_refiner
-from jaxshape.refine.objective import (
+from jaxshape.search import objective as module
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.objective import (
     BALANCED,
     PAPER,
     Target,
@@ -24,7 +24,7 @@ from jaxshape.refine.objective import (
     objective,
     target,
 )
-from jaxshape.refine.run import refine
+from jaxshape.search.run import refine
 
 SHAPE = (4, 3, 5)
 rng = np.random.default_rng(0)

@@ -7,9 +7,9 @@ import optax
 import pytest
 from problems import ellipsoid, rosenbrock, run, run_batch, sphere
 
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods.gradient import STEP_SIZES, build, gradient
-from jaxshape.refine.refiner import StopReason
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods.gradient import STEP_SIZES, build, gradient
+from jaxshape.search.refiner import StopReason
 
 KEY = jax.random.key(0)
 

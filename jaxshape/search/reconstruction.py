@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods import build_refiner
-from jaxshape.refine.objective import BALANCED, PAPER, cross_entropy, target
-from jaxshape.refine.refiner import Refiner, Trace
-from jaxshape.refine.run import Penalty, refine
-from jaxshape.refine.space import LatentSpace, raw, whitened
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.objective import BALANCED, PAPER, cross_entropy, target
+from jaxshape.search.refiner import Refiner, Trace
+from jaxshape.search.run import Penalty, refine
+from jaxshape.search.space import LatentSpace, raw, whitened
 
 
 class Reconstruction(NamedTuple):

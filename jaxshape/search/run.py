@@ -10,11 +10,11 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from jaxshape.model.autoencoder import decode, prepare_decoder
-from jaxshape.refine.batching import select
-from jaxshape.refine.config import Precision
-from jaxshape.refine.objective import Target, cross_entropy, objective
-from jaxshape.refine.refiner import Objective, Refiner, StopReason, Trace, finite_or_inf
-from jaxshape.refine.space import LatentSpace
+from jaxshape.search.batching import select
+from jaxshape.search.config import Precision
+from jaxshape.search.objective import Target, cross_entropy, objective
+from jaxshape.search.refiner import Objective, Refiner, StopReason, Trace, finite_or_inf
+from jaxshape.search.space import LatentSpace
 
 # What a code costs besides its objective.
 Penalty = Callable[[Float[Array, " d"]], Float[Array, ""]]

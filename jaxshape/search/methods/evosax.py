@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from evosax.algorithms.distribution_based import distribution_based_algorithms
 from jaxtyping import Array, Float, Int
 
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.refiner import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.refiner import (
     Candidate,
     Objective,
     Refiner,

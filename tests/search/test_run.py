@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.refine.config import RefineConfig
-from jaxshape.refine.methods import build_refiner
-from jaxshape.refine.objective import cross_entropy, target
-from jaxshape.refine.refiner import StopReason
-from jaxshape.refine.run import refine
-from jaxshape.refine.space import LatentSpace
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.objective import cross_entropy, target
+from jaxshape.search.refiner import StopReason
+from jaxshape.search.run import refine
+from jaxshape.search.space import LatentSpace
 
 OBJECTS, D, SHAPE, ITERATIONS = 3, 4, (3, 3, 3), 8
 KEYS = jax.random.split(jax.random.key(0), OBJECTS)

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxshape.refine.refiner import StopReason
-from jaxshape.refine.stopping import Tolerances
+from jaxshape.search.refiner import StopReason
+from jaxshape.search.stopping import Tolerances
 
 NEVER = Tolerances(
     tolfun=0.0,
@@ -51,7 +51,7 @@ def rastrigin(x):
 
 
 def advance(refiner, objective, key, state, trace):
-    """One iteration; nothing where the search has stopped, as in `jaxshape.refine.run`."""
+    """One iteration; nothing where the search has stopped, as in `jaxshape.search.run`."""
     running = state.stop == StopReason.RUNNING
     moved = refiner.step(key, state, objective)
     return jax.tree.map(lambda new, old: jnp.where(running, new, old), moved, (state, trace))
