@@ -34,7 +34,8 @@ from jaxshape.mapping.keyframes import Keyframe
 from jaxshape.mapping.recording import Progress, follow
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.mapping.state import State, grids_of
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING

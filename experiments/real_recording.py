@@ -38,7 +38,8 @@ from jaxshape.mapping.keyframes import as_pose, prepare
 from jaxshape.mapping.recording import Progress, follow, trajectory
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.mapping.tracking import displacement
-from jaxshape.model.weights import ShapePrior, load_prior
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.pictures import Panel, grid_panel, overview, render_mesh

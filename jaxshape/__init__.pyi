@@ -3,6 +3,7 @@ from .data.chairs import random_chair
 from .data.meshes import load, read_meshes
 from .data.sequences import Trajectory, open_sequence, read_trajectory, write_trajectory
 from .geometry.camera import Intrinsics, orbit, random_views
+from .geometry.evidence import Grids, binary
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
 from .mapping.config import MappingConfig, TrackingConfig
@@ -12,9 +13,9 @@ from .mapping.keyframes import Shot
 from .mapping.placement import Placement, PlacementConfig, place
 from .mapping.recording import Progress, follow, trajectory
 from .mapping.segmentation import Prompt, Segmentation, segment
-from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
 from .model.config import Architecture
-from .model.weights import ShapePrior, load_prior, save_prior
+from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
+from .model.weights import load_prior, save_prior
 from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
 from .results.report import write_report
 from .results.surface import surface, write_mesh
@@ -24,7 +25,7 @@ from .search.methods import build_refiner
 from .search.methods.evosax import evosax_strategy
 from .search.methods.gradient import gradient
 from .search.methods.hybrid import polished
-from .search.objective import Target, Weights, objective, target
+from .search.objective import objective
 from .search.reconstruction import (
     Reconstruction,
     compose,
@@ -33,6 +34,18 @@ from .search.reconstruction import (
     refiner_for,
 )
 from .search.refiner import Distribution, Refiner, StopReason, Trace
+from .search.residuals import (
+    BALANCED,
+    PAPER,
+    SOFT,
+    Residual,
+    Target,
+    Weights,
+    cross_entropy,
+    equation_7,
+    soft,
+    weigh,
+)
 from .search.restarts import with_restarts
 from .search.run import Refined, refine
 from .search.space import LatentSpace, raw, whitened
@@ -40,24 +53,30 @@ from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",
+    "BALANCED",
     "Capture",
     "Distribution",
     "GridFrame",
+    "Grids",
     "Intrinsics",
     "LatentSpace",
     "Mapper",
     "MappingConfig",
     "Measurement",
+    "PAPER",
     "Placement",
     "PlacementConfig",
-    "PreparedDecoder",
+    "Prepared",
     "Progress",
     "Prompt",
     "Reconstruction",
     "RefineConfig",
     "Refined",
     "Refiner",
+    "Residual",
+    "SOFT",
     "Segmentation",
+    "ShapeModel",
     "ShapePrior",
     "Shot",
     "StopReason",
@@ -67,6 +86,7 @@ __all__ = [
     "TrackingConfig",
     "Trajectory",
     "Weights",
+    "binary",
     "bounds",
     "build_mapper",
     "build_refiner",
@@ -74,8 +94,11 @@ __all__ = [
     "chamfer_l1",
     "cma",
     "compose",
+    "cross_entropy",
     "decode",
+    "decode_prepared",
     "encode",
+    "equation_7",
     "evosax_strategy",
     "f_score",
     "find_start",
@@ -84,7 +107,6 @@ __all__ = [
     "fit_surface",
     "follow",
     "gradient",
-    "initialize",
     "iou",
     "load",
     "load_prior",
@@ -99,7 +121,6 @@ __all__ = [
     "orbit",
     "place",
     "polished",
-    "prepare_decoder",
     "random_chair",
     "random_views",
     "raw",
@@ -111,9 +132,10 @@ __all__ = [
     "save_prior",
     "segment",
     "shape_scores",
+    "soft",
     "surface",
-    "target",
     "trajectory",
+    "weigh",
     "whitened",
     "with_restarts",
     "write_mesh",

@@ -20,7 +20,7 @@ from jaxshape.mapping.recording import follow
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.model.autoencoder import initialize
 from jaxshape.model.config import Architecture
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.search import objective, reconstruction, run
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for

@@ -258,7 +258,7 @@ import sys
 import numpy as np
 sys.path.insert(0, sys.argv.pop(1))
 from known_shape import install
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 with np.load(sys.argv.pop(1)) as file:
     params = dict(file)
 from jaxshape.results import output, report

@@ -19,7 +19,7 @@ from jaxshape.mapping.placement import Placement
 from jaxshape.mapping.planes import Floor, camera_points, dominant_planes, floor_plane
 from jaxshape.mapping.segmentation import Prompt, Segmentation, segment
 from jaxshape.mapping.sight import pooled, sight
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 
 SURE = 0.5
 """Confidence of a segmentation from which a frame may be the first."""

@@ -50,7 +50,7 @@ from jaxshape.mapping.state import (
     realigned_poses,
     with_surface,
 )
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct_jit
 from jaxshape.search.refiner import Refiner

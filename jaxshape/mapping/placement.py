@@ -27,10 +27,10 @@ from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Int
 
 from jaxshape.geometry import fusion, grid
-from jaxshape.geometry.grid import MARGIN, RESOLUTION
+from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grid import MARGIN
 from jaxshape.mapping.sight import Sight
-from jaxshape.model.autoencoder import decode, encode, prepare_decoder
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior, decode_prepared, encode, pick
 from jaxshape.search.batching import select
 from jaxshape.search.refiner import finite_or_inf
 from jaxshape.search.space import whitened
@@ -147,9 +147,10 @@ def turn(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
     return jaxlie.SO3.from_y_radians(yaw).as_matrix()
 
 
-def to_voxels(box: Box, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+def to_voxels(box: Box, points: Float[Array, "n 3"], resolution: int) -> Float[Array, "n 3"]:
     """Points in the voxel coordinates of the grid that the box fills."""
-    return grid.voxel_from_object(grid.fit_box(box.lower, box.upper), points @ turn(box.yaw))
+    frame = grid.fit_box(box.lower, box.upper, resolution=resolution)
+    return grid.voxel_from_object(frame, points @ turn(box.yaw))
 
 
 # ------------------------------------------------------------------------ how well they explain
@@ -164,8 +165,9 @@ def misfit(
     points, that it is not, each a mean over points, and of the box's size. Differentiable in the
     logits and in the box.
     """
-    surface, free = to_voxels(box, seen.surface[:COMPARED_POINTS]), to_voxels(box, seen.free)
-    outside = jnp.abs(surface - jnp.clip(surface, MARGIN, RESOLUTION - MARGIN)).sum(axis=-1)
+    n = logits.shape[-1]
+    surface, free = to_voxels(box, seen.surface[:COMPARED_POINTS], n), to_voxels(box, seen.free, n)
+    outside = jnp.abs(surface - jnp.clip(surface, MARGIN, n - MARGIN)).sum(axis=-1)
     unusual = jnp.log((box.upper - box.lower) / jnp.array(config.typical_size))
     anywhere, amid = _look_up(_corners(logits), surface), _look_up(logits, surface - 0.5)
     return (
@@ -244,24 +246,31 @@ def place(
     center = jnp.median(seen.surface, axis=0)
     seen = seen._replace(surface=seen.surface - center, free=seen.free - center)
     floor = floor - center[1]
-    space, decoder = whitened(prior), prepare_decoder(prior.params)
+    space, n = whitened(prior), prior.resolution
 
-    def misfits(hypothesis):
-        logits = decode(decoder, jax.vmap(space.to_code)(hypothesis.point))
+    def holds(box, points):
+        return fusion.count_points(to_voxels(box, points, n), n) > 0
+
+    boxes = propose(seen, floor, config)
+    earlier = _standing(_box_of(known, center), floor)
+    boxes = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), earlier, boxes)
+    occupied = jax.vmap(holds, (0, None))(boxes, seen.surface)
+    occluded = ~(occupied | jax.vmap(holds, (0, None))(boxes, seen.free))
+    grids = Grids(occupied, occluded)
+    codes = encode(prior, grids).at[0].set(known.code)
+    proposed = Hypothesis(boxes, jax.vmap(space.from_code)(codes))
+    decoder = prior.model.prepare(prior.params, grids, "float32")
+
+    def misfits(hypothesis, decoder):
+        codes = jax.vmap(space.to_code)(hypothesis.point)
+        logits = decode_prepared(prior.model, decoder, codes)
         fit = jax.vmap(partial(misfit, seen=seen, config=config))(logits, hypothesis.box)
         return fit + CODE_WEIGHT * 0.5 * jnp.sum(hypothesis.point**2, axis=-1)
 
-    def encoded(boxes):
-        measured = jax.vmap(lambda box: fusion.count_points(to_voxels(box, seen.surface)) > 0)
-        return jax.vmap(space.from_code)(encode(prior.params, measured(boxes)))
-
-    boxes = propose(seen, floor, config)
-    earlier = Hypothesis(_standing(_box_of(known, center), floor), space.from_code(known.code))
-    proposed = Hypothesis(boxes, encoded(boxes))
-    proposed = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), earlier, proposed)
-    first = finite_or_inf(misfits(proposed))
+    first = finite_or_inf(misfits(proposed, decoder))
     chosen = _most_promising(first, config)
-    start = jax.tree.map(lambda x: x[chosen], proposed)
+    start = pick(proposed, chosen)
+    misfits = partial(misfits, decoder=decoder._replace(own=pick(decoder.own, chosen)))
 
     width = 0.015 * jnp.array(config.typical_size)
     on_floor = width.at[1].multiply(jnp.isnan(floor))

@@ -27,7 +27,7 @@ from jaxshape.mapping.incremental import Mapper, Step
 from jaxshape.mapping.keyframes import Keyframe, as_pose, prepare, resized
 from jaxshape.mapping.segmentation import segment_inside
 from jaxshape.mapping.state import State
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.reconstruction import Reconstruction
 
 PLACE_AGAIN = (2, 3, 5, 8, 13)

@@ -18,7 +18,7 @@ from jaxshape.mapping.keyframes import Keyframe, Place
 from jaxshape.mapping.realign import Odometry, realign
 from jaxshape.mapping.surfels import Lattice, Sums, Surface
 from jaxshape.mapping.views import View
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 
 _CAPACITIES = (8, 16, 32, 64, 128, 256, 512)  # keyframes for which realigning is compiled
 

@@ -35,7 +35,7 @@ from jaxshape.mapping.keyframes import Keyframe, Place, Shot, keyframe_of, place
 from jaxshape.mapping.placement import Placement
 from jaxshape.mapping.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.state import State, assemble
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.results.output import Observation, write_shape
 
 STATE = "state.npz"

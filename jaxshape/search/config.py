@@ -3,15 +3,16 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Precision = Literal["float32", "bfloat16"]
+from jaxshape.model.config import Precision
 
 
 @dataclass(frozen=True)
 class RefineConfig:
     """How a shape is searched for."""
 
-    objective: Literal["balanced", "paper"] = "balanced"
-    """`paper` is Eq. 7 as printed; in `balanced` measured free space counts a third."""
+    objective: Literal["balanced", "paper", "soft"] = "balanced"
+    """`paper` is Eq. 7 as printed; in `balanced` measured free space counts a third; in `soft` each
+    voxel counts by how sure its measurement is."""
     iterations: int = 350
     """Steps of the search at most (paper: 350)."""
     population: int = 17
