@@ -46,7 +46,7 @@ def whole(name: str, value: Any, least: int) -> None:
         value: What it was given.
         least: The smallest number it takes.
     """
-    if not (isinstance(value, Integral) and not isinstance(value, bool) and value >= least):
+    if not (_is_number(value) and isinstance(value, Integral) and int(value) >= least):
         refuse(name, value, f"a whole number, {least} or more")
 
 
@@ -62,7 +62,7 @@ def positive(name: str, value: Any, unit: str = "") -> None:
         refuse(name, value, f"a number of {unit} above 0" if unit else "a number above 0")
 
 
-def at_least(name: str, value: Any, least: float) -> None:
+def at_least(name: str, value: Any, least: int | float) -> None:
     """Refuse what is not a finite number from `least` up.
 
     Args:
@@ -74,7 +74,7 @@ def at_least(name: str, value: Any, least: float) -> None:
         refuse(name, value, f"a number, {least:g} or more")
 
 
-def within(name: str, value: Any, low: float, high: float) -> None:
+def within(name: str, value: Any, low: int | float, high: int | float) -> None:
     """Refuse what is not a number between two others, or one of them.
 
     Args:
