@@ -28,12 +28,12 @@ from jaxshape.data.boxes import Box, read_box
 from jaxshape.data.sequences import Sequence as Recording
 from jaxshape.data.sequences import open_sequence
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.finding import find_start
-from jaxshape.mapping.incremental import Mapper, build_mapper
-from jaxshape.mapping.keyframes import Keyframe
-from jaxshape.mapping.recording import Progress, follow
-from jaxshape.mapping.segmentation import Prompt
-from jaxshape.mapping.state import State, grids_of
+from jaxshape.mapping.map.mapper import Mapper, build_mapper
+from jaxshape.mapping.map.recording import Progress, follow
+from jaxshape.mapping.map.state import State, grids_of
+from jaxshape.mapping.placement.finding import find_start
+from jaxshape.mapping.segmentation.segment import Prompt
+from jaxshape.mapping.tracking.keyframes import Keyframe
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
 from jaxshape.results.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
 from jaxshape.results.journal import Journal

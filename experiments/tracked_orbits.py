@@ -39,9 +39,9 @@ from jaxshape.data.capture import Capture, capture
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.incremental import Mapper, Step, build_mapper
-from jaxshape.mapping.keyframes import Shot
-from jaxshape.mapping.views import view_of
+from jaxshape.mapping.map.mapper import Mapper, Step, build_mapper
+from jaxshape.mapping.tracking.keyframes import Shot
+from jaxshape.mapping.tracking.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
 from jaxshape.results.metrics import iou

@@ -6,12 +6,12 @@ from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
 from .mapping.config import MappingConfig, TrackingConfig
-from .mapping.finding import find_start
-from .mapping.incremental import Mapper, build_mapper
-from .mapping.keyframes import Shot
-from .mapping.placement import Placement, PlacementConfig, place
-from .mapping.recording import Progress, follow, trajectory
-from .mapping.segmentation import Prompt, Segmentation, segment
+from .mapping.map.mapper import Mapper, build_mapper
+from .mapping.map.recording import Progress, follow, trajectory
+from .mapping.placement.finding import find_start
+from .mapping.placement.placing import Placement, PlacementConfig, place
+from .mapping.segmentation.segment import Prompt, Segmentation, segment
+from .mapping.tracking.keyframes import Shot
 from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
 from .model.config import Architecture
 from .model.weights import ShapePrior, load_prior, save_prior

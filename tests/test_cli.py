@@ -22,9 +22,10 @@ from jaxshape.data import dataset, sequences
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.split import hold_out
-from jaxshape.mapping import finding, incremental
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.segmentation import Prompt
+from jaxshape.mapping.map import mapper
+from jaxshape.mapping.placement import finding
+from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model import training, weights
 from jaxshape.model.config import PRESETS
 from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prior
@@ -371,7 +372,7 @@ def test_options_reach_the_map_and_the_search_of_the_object(
         asked.update(prompt=prompt, options=options)
         raise OSError("enough.")
 
-    monkeypatch.setattr(incremental, "build_mapper", build_mapper)
+    monkeypatch.setattr(mapper, "build_mapper", build_mapper)
     monkeypatch.setattr(finding, "find_start", find_start)
     prompt = ("--click", 10, 20, "--region", 0, 0, 40, 40.5, "--depth-range", 0.5, 3)
     tracking = ("--against", "keyframe", "--on", "object", "--min-inliers", 0.5, "--max-angle", 9)

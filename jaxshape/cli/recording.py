@@ -62,10 +62,10 @@ class Reconstruct(Rebuild):
 
         from jaxshape.data.boxes import read_box
         from jaxshape.data.sequences import open_sequence
-        from jaxshape.mapping.finding import find_start
-        from jaxshape.mapping.incremental import build_mapper
-        from jaxshape.mapping.recording import follow
-        from jaxshape.mapping.segmentation import Prompt, check_prompt
+        from jaxshape.mapping.map.mapper import build_mapper
+        from jaxshape.mapping.map.recording import follow
+        from jaxshape.mapping.placement.finding import find_start
+        from jaxshape.mapping.segmentation.segment import Prompt, check_prompt
         from jaxshape.model.weights import fingerprint
         from jaxshape.results.progress import (
             load_state,

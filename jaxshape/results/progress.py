@@ -30,11 +30,18 @@ from jaxshape.data.sequences import (
 )
 from jaxshape.files import atomic_path
 from jaxshape.geometry import fusion
-from jaxshape.mapping.finding import Start, room
-from jaxshape.mapping.keyframes import Keyframe, Place, Shot, keyframe_of, place_of, prepare
-from jaxshape.mapping.placement import Placement
-from jaxshape.mapping.recording import FrameLog, Progress, trajectory
-from jaxshape.mapping.state import State, assemble
+from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
+from jaxshape.mapping.map.state import State, assemble
+from jaxshape.mapping.placement.finding import Start, room
+from jaxshape.mapping.placement.placing import Placement
+from jaxshape.mapping.tracking.keyframes import (
+    Keyframe,
+    Place,
+    Shot,
+    keyframe_of,
+    place_of,
+    prepare,
+)
 from jaxshape.model.weights import ShapePrior
 from jaxshape.results.output import Observation, write_shape
 

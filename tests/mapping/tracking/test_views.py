@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from jaxshape.data.render import add_sensor_noise
 from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
-from jaxshape.mapping import views
+from jaxshape.mapping.tracking import views
 
 SHAPE = (60, 80)
 LENS = Intrinsics(*jnp.float32([131.0, 128.0, 43.0, 28.5]))

@@ -9,9 +9,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from jaxshape.geometry.camera import Intrinsics
-from jaxshape.mapping import icp
-from jaxshape.mapping.icp import Cloud, Matches
-from jaxshape.mapping.views import View, view_of
+from jaxshape.mapping.tracking import icp
+from jaxshape.mapping.tracking.icp import Cloud, Matches
+from jaxshape.mapping.tracking.views import View, view_of
 
 SIGMA = 0.002
 """Standard deviation, in metres, claimed for all points here."""

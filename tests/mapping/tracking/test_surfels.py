@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from jaxshape.mapping import surfels
-from jaxshape.mapping.surfels import CELLS, Lattice, Sums
+from jaxshape.mapping.tracking import surfels
+from jaxshape.mapping.tracking.surfels import CELLS, Lattice, Sums
 
 CENTER = np.array([4.0, -2.0, 7.0])
 SIZE = np.array([0.64, 0.96, 0.8])

@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
-from jaxshape.mapping.planes import (
+from jaxshape.mapping.segmentation.planes import (
     Floor,
     Plane,
     camera_points,

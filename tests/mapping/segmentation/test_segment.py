@@ -3,7 +3,7 @@ import pytest
 from analytic_room import CHAIR, CRATE, FLOOR, HEIGHT, TABLE, WALLS, WIDTH, K, iou, room
 
 from jaxshape.data.boxes import Box
-from jaxshape.mapping.segmentation import Prompt, segment, segment_inside
+from jaxshape.mapping.segmentation.segment import Prompt, segment, segment_inside
 
 GROUPS = [FLOOR, WALLS, CHAIR, CRATE, TABLE]
 COLORS = np.array([[90, 90, 95], [200, 190, 180], [120, 60, 30], [40, 90, 160], [30, 120, 60]])

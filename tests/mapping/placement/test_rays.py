@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxshape.geometry import camera
-from jaxshape.mapping.sight import pooled, sight
+from jaxshape.mapping.placement.rays import pooled, sight
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.geometry import camera
-from jaxshape.mapping.views import View, depth_deviation, is_oriented
+from jaxshape.mapping.tracking.views import View, depth_deviation, is_oriented
 
 CUTOFF = 4.0
 """Standard deviations beyond which a residual has no weight (Tukey's function)."""

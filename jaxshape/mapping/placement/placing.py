@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
-from jaxshape.mapping.sight import Sight
+from jaxshape.mapping.placement.rays import Sight
 from jaxshape.model.autoencoder import decode, encode, prepare_decoder
 from jaxshape.model.weights import ShapePrior
 from jaxshape.search.batching import select

@@ -7,10 +7,10 @@ from analytic_room import CHAIR, CRATE, FLOOR, TABLE, WALLS, K, room
 from scipy.spatial.transform import Rotation
 
 from jaxshape.geometry.camera import Intrinsics
-from jaxshape.mapping import icp, tracking
 from jaxshape.mapping.config import TrackingConfig
-from jaxshape.mapping.icp import Alignment
-from jaxshape.mapping.views import view_of
+from jaxshape.mapping.tracking import icp, registration
+from jaxshape.mapping.tracking.icp import Alignment
+from jaxshape.mapping.tracking.views import view_of
 
 LENS = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
 CENTER = np.array([0.0, 0.45, 0.0])
@@ -21,13 +21,15 @@ prepare = jax.jit(view_of)
 
 @jax.jit
 def register(view, segmented, reference, T):
-    return tracking.register(view, segmented, icp.match_view(reference, jaxlie.SE3.identity()), T)
+    return registration.register(
+        view, segmented, icp.match_view(reference, jaxlie.SE3.identity()), T
+    )
 
 
 @jax.jit
 def register_from(view, segmented, reference, T):
     match = icp.match_view(reference, jaxlie.SE3.identity())
-    return tracking.register_from(view, segmented, match, T)
+    return registration.register_from(view, segmented, match, T)
 
 
 def seen_from(azimuth, groups=FURNITURE, *, seed):
@@ -57,7 +59,7 @@ def relative(second):
 def test_steps_of_up_to_twenty_degrees_are_found(azimuth):
     second = seen_from(azimuth, seed=1)
     found = register(prepare(second.depth, LENS), ALL, REFERENCE, STILL)
-    metres, degrees = tracking.displacement(found.T_reference_source, relative(second))
+    metres, degrees = registration.displacement(found.T_reference_source, relative(second))
     assert metres < 0.006 and degrees < 0.1
     assert found.converged and found.inlier_fraction > 0.8 and found.conditioning > 1e-3
 
@@ -67,12 +69,12 @@ def test_a_wide_step_needs_many_guesses(azimuth):
     second = seen_from(azimuth, seed=1)
     view, truth = prepare(second.depth, LENS), relative(second)
     alone = register(view, ALL, REFERENCE, STILL)
-    assert tracking.displacement(alone.T_reference_source, truth)[0] > 0.1
+    assert registration.displacement(alone.T_reference_source, truth)[0] > 0.1
     center = jnp.float32(np.linalg.inv(FIRST.T_world_camera) @ [*CENTER, 1])[:3]
-    found = register_from(view, ALL, REFERENCE, tracking.guesses(STILL, center))
-    metres, degrees = tracking.displacement(found.T_reference_source, truth)
+    found = register_from(view, ALL, REFERENCE, registration.guesses(STILL, center))
+    metres, degrees = registration.displacement(found.T_reference_source, truth)
     assert metres < 0.01 and degrees < 0.15
-    assert tracking.score(found) > tracking.score(alone)
+    assert registration.score(found) > registration.score(alone)
 
 
 @pytest.mark.parametrize("by", [0.3, 0.6])
@@ -80,7 +82,7 @@ def test_something_that_walks_through_the_picture_moves_the_pose_by_millimetres(
     walked = [((low[0] + by, *low[1:]), (high[0] + by, *high[1:])) for low, high in CRATE]
     second = seen_from(-5, (*FURNITURE[:-1], walked), seed=1)
     found = register(prepare(second.depth, LENS), ALL, REFERENCE, STILL)
-    metres, degrees = tracking.displacement(found.T_reference_source, relative(second))
+    metres, degrees = registration.displacement(found.T_reference_source, relative(second))
     assert metres < 0.01 and degrees < 0.1
 
 
@@ -97,16 +99,19 @@ def test_only_the_segmented_pixels_count():
     )
     found = [register(one, chair, REFERENCE, STILL) for one in (view, other)]
     jax.tree.map(np.testing.assert_array_equal, *found)
-    assert tracking.displacement(found[0].T_reference_source, relative(second))[0] < 0.03
+    assert registration.displacement(found[0].T_reference_source, relative(second))[0] < 0.03
 
 
 @pytest.mark.parametrize("content", ["unknown", "empty"])
 def test_a_frame_that_shows_nothing_is_doubted(content):
     depth = np.full(FIRST.depth.shape, 0 if content == "unknown" else np.inf, np.float32)
-    for search, T in ((register, STILL), (register_from, tracking.guesses(STILL, CENTER_AHEAD))):
+    for search, T in (
+        (register, STILL),
+        (register_from, registration.guesses(STILL, CENTER_AHEAD)),
+    ):
         found = search(prepare(depth, LENS), ALL, REFERENCE, T)
         assert not found.converged
-        assert tracking.doubt(found, STILL, TrackingConfig()) is not None
+        assert registration.doubt(found, STILL, TrackingConfig()) is not None
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(found))
 
 
@@ -117,7 +122,7 @@ CENTER_AHEAD = jnp.array([0.0, 0.0, 2.2])
 
 def test_guesses_start_with_the_pose_itself_and_keep_their_distance():
     T = as_pose(FIRST.T_world_camera)
-    many = tracking.guesses(T, jnp.float32(CENTER), count=24, reach=40.0)
+    many = registration.guesses(T, jnp.float32(CENTER), count=24, reach=40.0)
     np.testing.assert_allclose(many.wxyz_xyz[0], T.wxyz_xyz, atol=1e-6)
     offsets = np.asarray(many.translation()) - CENTER
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), np.linalg.norm(offsets[0]),
@@ -125,7 +130,7 @@ def test_guesses_start_with_the_pose_itself_and_keep_their_distance():
     # The point they turn about stays where it was in the picture.
     ahead = jax.vmap(lambda one: one.inverse() @ jnp.float32(CENTER))(many)
     np.testing.assert_allclose(ahead, np.broadcast_to(ahead[0], ahead.shape), atol=1e-5)
-    turned = [tracking.displacement(T, jaxlie.SE3(x))[1] for x in many.wxyz_xyz]
+    turned = [registration.displacement(T, jaxlie.SE3(x))[1] for x in many.wxyz_xyz]
     assert 39.9 < max(turned) < 43 and len(turned) == 25
 
 
@@ -135,7 +140,7 @@ def test_displacement_is_that_of_the_relative_pose():
         A, B = np.eye(4), np.eye(4)
         for T in (A, B):
             T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
-        metres, degrees = tracking.displacement(as_pose(A), as_pose(B))
+        metres, degrees = registration.displacement(as_pose(A), as_pose(B))
         D = np.linalg.inv(A) @ B
         assert metres == pytest.approx(np.linalg.norm(D[:3, 3]), rel=1e-4)
         angle = np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec())
@@ -174,12 +179,12 @@ GOOD = Alignment(
     ],
 )
 def test_a_doubtful_pose_has_a_reason(change, reason):
-    assert tracking.doubt(GOOD._replace(**change), STILL, TrackingConfig()) == reason
+    assert registration.doubt(GOOD._replace(**change), STILL, TrackingConfig()) == reason
 
 
 def test_the_score_prefers_what_explains_more():
     worse = [{"overlap": jnp.float32(0.5)}, {"inlier_fraction": jnp.float32(0.7)}]
     for change in worse:
-        assert tracking.score(GOOD._replace(**change)) < tracking.score(GOOD)
+        assert registration.score(GOOD._replace(**change)) < registration.score(GOOD)
     # What should have been seen and was not counts against a pose.
-    assert tracking.score(GOOD._replace(inlier_fraction=jnp.float32(0.2))) < 0
+    assert registration.score(GOOD._replace(inlier_fraction=jnp.float32(0.2))) < 0

@@ -6,10 +6,11 @@ import pytest
 from analytic_room import look_from
 from scipy.spatial.transform import Rotation
 
-from jaxshape.mapping import realign, surfels
-from jaxshape.mapping.icp import Cloud
-from jaxshape.mapping.realign import Odometry
-from jaxshape.mapping.surfels import CELLS, Lattice
+from jaxshape.mapping.map import realign
+from jaxshape.mapping.map.realign import Odometry
+from jaxshape.mapping.tracking import surfels
+from jaxshape.mapping.tracking.icp import Cloud
+from jaxshape.mapping.tracking.surfels import CELLS, Lattice
 
 COUNT = 6  # keyframes
 SIDE = 1.0  # metres, of the cube about what is seen

@@ -14,9 +14,9 @@ from scipy.interpolate import RegularGridInterpolator
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.render import add_sensor_noise, fit_intrinsics, render_depth
 from jaxshape.geometry import camera
-from jaxshape.mapping import placement
-from jaxshape.mapping.placement import Box, Hypothesis, PlacementConfig
-from jaxshape.mapping.sight import FREE_POINTS, SURFACE_POINTS, Sight, pooled, sight
+from jaxshape.mapping.placement import placing
+from jaxshape.mapping.placement.placing import Box, Hypothesis, PlacementConfig
+from jaxshape.mapping.placement.rays import FREE_POINTS, SURFACE_POINTS, Sight, pooled, sight
 from jaxshape.model.weights import load_prior
 
 CONFIG = PlacementConfig(yaws=12, overhangs=(0.0, 0.35), kept=4, steps=30, steps_again=10)
@@ -45,22 +45,22 @@ BOX = Box(jnp.array(0.4), jnp.array([-0.31, -0.3, -0.33]), jnp.array([0.35, 0.36
 
 def test_boxes_hold_the_points_stand_on_the_floor_and_reach_away_from_the_camera():
     seen = random_sight(surface=SURFACE_POINTS)
-    boxes = placement.propose(seen, jnp.array(-0.7), CONFIG)
+    boxes = placing.propose(seen, jnp.array(-0.7), CONFIG)
     assert len(boxes.yaw) == CONFIG.yaws * len(CONFIG.overhangs)
     np.testing.assert_allclose(boxes.lower[:, 1], -0.7)
-    voxels = jax.vmap(lambda box: placement.to_voxels(box, seen.surface))(boxes)
+    voxels = jax.vmap(lambda box: placing.to_voxels(box, seen.surface))(boxes)
     assert ((voxels > 0.5) & (voxels < 31.5)).all(axis=-1).mean() > 0.98
     tight, wide = (jax.tree.map(lambda x, n=n: x[n], boxes) for n in (0, CONFIG.yaws))
     assert wide.yaw == tight.yaw == 0
     assert (wide.upper - tight.upper)[0] > 0 == (wide.lower - tight.lower)[0]  # looks along +x
     assert (wide.lower - tight.lower)[2] < 0 == (wide.upper - tight.upper)[2]  # and along -z
-    unknown = placement.propose(seen, UNKNOWN, CONFIG)
+    unknown = placing.propose(seen, UNKNOWN, CONFIG)
     np.testing.assert_allclose(unknown.lower[:, 1], -0.3, atol=0.01)
 
 
 def test_the_box_fills_the_grid():
-    corners = jnp.stack([BOX.lower, BOX.upper]) @ placement.turn(BOX.yaw).T
-    voxels = placement.to_voxels(BOX, corners)
+    corners = jnp.stack([BOX.lower, BOX.upper]) @ placing.turn(BOX.yaw).T
+    voxels = placing.to_voxels(BOX, corners)
     np.testing.assert_allclose(voxels, [[1.01] * 3, [30.99] * 3], atol=1e-4)
 
 
@@ -69,10 +69,10 @@ def test_the_box_fills_the_grid():
 
 def slow_misfit(logits, box, seen, config):
     """One point after the other, in NumPy."""
-    padded = np.pad(np.asarray(logits), 1, constant_values=placement.EMPTY)
+    padded = np.pad(np.asarray(logits), 1, constant_values=placing.EMPTY)
     at_centers = RegularGridInterpolator([np.arange(-1, 33) + 0.5] * 3, padded)
     around = sliding_window_view(padded, (2, 2, 2)).max(axis=(-3, -2, -1))
-    around = np.pad(around, 1, constant_values=placement.EMPTY)
+    around = np.pad(around, 1, constant_values=placing.EMPTY)
     at_corners = RegularGridInterpolator([np.arange(-1, 34)] * 3, around)
     c, s = np.cos(float(box.yaw)), np.sin(float(box.yaw))
     lower, upper = np.asarray(box.lower), np.asarray(box.upper)
@@ -82,7 +82,7 @@ def slow_misfit(logits, box, seen, config):
         return 1.01 + (turned - lower) / (upper - lower) * (32 - 2.02)
 
     def logit(field, v):
-        return field(np.clip(v, -0.5, 32.5))[0] if (np.abs(v - 16) < 17).all() else placement.EMPTY
+        return field(np.clip(v, -0.5, 32.5))[0] if (np.abs(v - 16) < 17).all() else placing.EMPTY
 
     def surprise(probability):
         return -np.log(0.03 + 0.97 * probability)
@@ -102,7 +102,7 @@ def slow_misfit(logits, box, seen, config):
 
 def test_misfit_agrees_with_a_slow_reference():
     seen = random_sight()
-    fast = placement.misfit(smooth_logits(), BOX, seen, CONFIG)
+    fast = placing.misfit(smooth_logits(), BOX, seen, CONFIG)
     np.testing.assert_allclose(fast, slow_misfit(smooth_logits(), BOX, seen, CONFIG), rtol=1e-4)
 
 
@@ -110,7 +110,7 @@ def test_misfit_has_the_right_gradient():
     with jax.enable_x64(True):
         widen = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tree)  # noqa: E731
         logits, box, seen = widen((smooth_logits(), BOX, random_sight()))
-        loss = jax.jit(lambda logits, box: placement.misfit(logits, box, seen, CONFIG))
+        loss = jax.jit(lambda logits, box: placing.misfit(logits, box, seen, CONFIG))
         check_grads(loss, (logits, box), order=1, modes=["rev"], eps=1e-6, rtol=1e-4)
 
 
@@ -118,15 +118,15 @@ def test_misfit_depends_on_neither_units_nor_the_world():
     """Everything twice as large, or all turned, explains as much."""
     twice = PlacementConfig(typical_size=tuple(2 * x for x in CONFIG.typical_size))
     seen, logits = random_sight(), smooth_logits()
-    expected = placement.misfit(logits, BOX, seen, CONFIG)
+    expected = placing.misfit(logits, BOX, seen, CONFIG)
     double = lambda x: 2 * x  # noqa: E731
     box = Box(BOX.yaw, 2 * BOX.lower, 2 * BOX.upper)
-    scaled = placement.misfit(logits, box, jax.tree.map(double, seen), twice)
+    scaled = placing.misfit(logits, box, jax.tree.map(double, seen), twice)
     np.testing.assert_allclose(scaled, expected, rtol=1e-4)
-    R = placement.turn(jnp.array(1.1))
+    R = placing.turn(jnp.array(1.1))
     turned = seen._replace(surface=seen.surface @ R.T, free=seen.free @ R.T)
     box = BOX._replace(yaw=BOX.yaw + 1.1)
-    np.testing.assert_allclose(placement.misfit(logits, box, turned, CONFIG), expected, rtol=1e-3)
+    np.testing.assert_allclose(placing.misfit(logits, box, turned, CONFIG), expected, rtol=1e-3)
 
 
 # ------------------------------------------------------------------------ the search
@@ -149,11 +149,11 @@ UNIT = Hypothesis(Box(*jnp.full(3, 0.1)), jnp.float32(0.1))
 
 def test_hypotheses_are_improved_each_on_its_own():
     start = hypotheses(3)
-    together = placement.improve(start, quadratic, UNIT, 20)
+    together = placing.improve(start, quadratic, UNIT, 20)
     assert (quadratic(together) < 0.5 * quadratic(start)).all()
     for i in range(3):
         one = jax.tree.map(lambda x, i=i: x[i : i + 1], start)
-        alone = placement.improve(one, quadratic, UNIT, 20)
+        alone = placing.improve(one, quadratic, UNIT, 20)
         jax.tree.map(
             lambda x, y, i=i: np.testing.assert_allclose(x[0], y[i], rtol=1e-4), alone, together
         )
@@ -163,7 +163,7 @@ def test_what_has_no_unit_stays_and_a_nan_stays_alone():
     start = hypotheses(3)
     start = start._replace(point=start.point.at[1].set(jnp.nan))
     unit = UNIT._replace(box=UNIT.box._replace(lower=jnp.array([0.1, 0.0, 0.1])))
-    found = placement.improve(start, quadratic, unit, 5)
+    found = placing.improve(start, quadratic, unit, 5)
     np.testing.assert_array_equal(found.box.lower[:, 1], start.box.lower[:, 1])
     assert (jnp.isfinite(found.point).all(axis=1) == jnp.array([True, False, True])).all()
 
@@ -171,9 +171,9 @@ def test_what_has_no_unit_stays_and_a_nan_stays_alone():
 def test_the_earlier_box_and_the_best_of_each_direction_come_first():
     config = PlacementConfig(yaws=6, overhangs=(0.0, 0.5), kept=4)
     by_yaw = jnp.array([[5.0, 1.0, 2.0, 9.0, 4.0, 6.0], [7.0, 7.5, 8.0, 3.0, 5.5, 9.5]])
-    chosen = placement._most_promising(jnp.array([10.0, *by_yaw.ravel()]), config)
+    chosen = placing._most_promising(jnp.array([10.0, *by_yaw.ravel()]), config)
     assert [int(i) for i in chosen] == [2, 10, 5, 7]  # 1, 3 and 4 have no better neighbour; then 7
-    chosen = placement._most_promising(jnp.array([0.5, *by_yaw.ravel()]), config)
+    chosen = placing._most_promising(jnp.array([0.5, *by_yaw.ravel()]), config)
     assert chosen[0] == 0
 
 
@@ -185,10 +185,10 @@ def prior():
 @pytest.fixture(scope="module")
 def find(prior):
     """One program for all scenes, with and without a floor and an earlier placement."""
-    place = jax.jit(partial(placement.place, config=CONFIG))
+    place = jax.jit(partial(placing.place, config=CONFIG))
 
     def find(seen, floor=UNKNOWN, known=None):
-        known = placement.nothing_known(prior) if known is None else known
+        known = placing.nothing_known(prior) if known is None else known
         return place(prior, seen, jnp.asarray(floor, jnp.float32), known)
 
     return find

@@ -26,20 +26,8 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxshape.data.boxes import Box
-from jaxshape.mapping import icp, surfels, tracking
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.icp import Alignment
-from jaxshape.mapping.keyframes import (
-    Cut,
-    Keyframe,
-    Shot,
-    cut_anew,
-    keyframe_of,
-    object_pixels,
-    place_of,
-    view_again,
-)
-from jaxshape.mapping.state import (
+from jaxshape.mapping.map.state import (
     State,
     added,
     assemble,
@@ -49,6 +37,18 @@ from jaxshape.mapping.state import (
     odometry_of,
     realigned_poses,
     with_surface,
+)
+from jaxshape.mapping.tracking import icp, registration, surfels
+from jaxshape.mapping.tracking.icp import Alignment
+from jaxshape.mapping.tracking.keyframes import (
+    Cut,
+    Keyframe,
+    Shot,
+    cut_anew,
+    keyframe_of,
+    object_pixels,
+    place_of,
+    view_again,
 )
 from jaxshape.model.weights import ShapePrior
 from jaxshape.search.config import RefineConfig
@@ -158,7 +158,7 @@ def build_mapper(
         surface = state.surface if track.against == "map" else no_surface(state.place.lattice)
         T_keyframe = state.keyframes[-1].T_world_camera
         found = _register(shot.view, pixels, state.view, T_keyframe, surface, T_expected)
-        reason = tracking.doubt(found, T_expected, track)
+        reason = registration.doubt(found, T_expected, track)
         is_sure = found.converged and found.inlier_fraction >= track.sure_inliers
         if reason is None and is_sure:
             return found, None
@@ -172,12 +172,12 @@ def build_mapper(
             again = _register_from(
                 shot.view, pixels, view, keyframe.T_world_camera, surface, T_near, center
             )
-            if tracking.score(again) > tracking.score(best):
+            if registration.score(again) > registration.score(best):
                 best = again
             limits = replace(track, max_angle=np.inf, max_distance=np.inf)
-            if tracking.doubt(best, T_expected, limits) is None:
+            if registration.doubt(best, T_expected, limits) is None:
                 return best, None
-        return best, reason or tracking.doubt(best, T_expected, track)
+        return best, reason or registration.doubt(best, T_expected, track)
 
     def _tracked_pixels(state: State, shot: Shot, T_expected: jaxlie.SE3) -> Bool[Array, "h w"]:
         if track.on == "scene":
@@ -187,7 +187,7 @@ def build_mapper(
     def has_moved(state: State, T: jaxlie.SE3) -> bool:
         """Whether a frame shows the object from elsewhere than the last keyframe."""
         T_last = state.keyframes[-1].T_world_camera
-        distance, turned = tracking.displacement(T_last, T)
+        distance, turned = registration.displacement(T_last, T)
         center = state.place.box.T_world_object[:3, 3]
         angle = _angle_about(center, T_last, T)
         return max(angle, turned) > mapping.keyframe_angle or distance > mapping.keyframe_distance
@@ -245,13 +245,13 @@ def build_mapper(
 @jax.jit
 def _register(view, pixels, reference, T_reference, surface, T_expected):
     match = icp.match_all(icp.match_view(reference, T_reference), surfels.match_surface(surface))
-    return tracking.register(view, pixels, match, T_expected)
+    return registration.register(view, pixels, match, T_expected)
 
 
 @jax.jit
 def _register_from(view, pixels, reference, T_reference, surface, T_near, center):
     match = icp.match_all(icp.match_view(reference, T_reference), surfels.match_surface(surface))
-    return tracking.register_from(view, pixels, match, tracking.guesses(T_near, center))
+    return registration.register_from(view, pixels, match, registration.guesses(T_near, center))
 
 
 def _worth_trying(keyframes: tuple[Keyframe, ...], count: int = 4) -> list[Keyframe]:
@@ -262,7 +262,7 @@ def _worth_trying(keyframes: tuple[Keyframe, ...], count: int = 4) -> list[Keyfr
 
 def _expected_again(motion: jaxlie.SE3) -> jaxlie.SE3:
     """The motion, where the camera may go on so; none after a jump, as over missing frames."""
-    distance, angle = tracking.displacement(motion, jaxlie.SE3.identity())
+    distance, angle = registration.displacement(motion, jaxlie.SE3.identity())
     return motion if distance < _JUMP[0] and angle < _JUMP[1] else jaxlie.SE3.identity()
 
 

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.geometry.grid import RESOLUTION
-from jaxshape.mapping.icp import AGREEING, Match, Matches
+from jaxshape.mapping.tracking.icp import AGREEING, Match, Matches
 
 CELLS = 2 * RESOLUTION
 """Cells along each axis: half a voxel each, some 1.5 cm on a chair."""

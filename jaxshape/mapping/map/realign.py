@@ -20,8 +20,8 @@ import jaxlie
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxshape.mapping.icp import Cloud, robust_weight
-from jaxshape.mapping.surfels import CELLS, FLAT, Lattice, Surface, cell_of
+from jaxshape.mapping.tracking.icp import Cloud, robust_weight
+from jaxshape.mapping.tracking.surfels import CELLS, FLAT, Lattice, Surface, cell_of
 
 OCCUPIED_CELLS = 12288
 """Cells that take part at most."""

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxshape.mapping.config import TrackingConfig
-from jaxshape.mapping.icp import Alignment, Match, align, cloud_of
-from jaxshape.mapping.views import View
+from jaxshape.mapping.tracking.icp import Alignment, Match, align, cloud_of
+from jaxshape.mapping.tracking.views import View
 
 
 class Level(NamedTuple):

@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float
 
 from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Frame, Sequence, SequenceError
-from jaxshape.mapping import placement
-from jaxshape.mapping.keyframes import Keyframe, as_pose, prepare, resized
-from jaxshape.mapping.placement import Placement
-from jaxshape.mapping.planes import Floor, camera_points, dominant_planes, floor_plane
-from jaxshape.mapping.segmentation import Prompt, Segmentation, segment
-from jaxshape.mapping.sight import pooled, sight
+from jaxshape.mapping.placement import placing
+from jaxshape.mapping.placement.placing import Placement
+from jaxshape.mapping.placement.rays import pooled, sight
+from jaxshape.mapping.segmentation.planes import Floor, camera_points, dominant_planes, floor_plane
+from jaxshape.mapping.segmentation.segment import Prompt, Segmentation, segment
+from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
 from jaxshape.model.weights import ShapePrior
 
 SURE = 0.5
@@ -228,7 +228,7 @@ def placed_again(start: Start, prior: ShapePrior, keyframes: tuple[Keyframe, ...
 def _placed(start: Start, prior: ShapePrior, sights: list) -> Start:
     """The start with the box that the prior finds; as it is where nothing can be placed."""
     assert start.T_level_world is not None
-    known = start.placement or placement.nothing_known(prior)
+    known = start.placement or placing.nothing_known(prior)
     each = [
         _sight(jax.random.key(number), depth, masked, intrinsics)
         for number, (depth, masked, intrinsics, _) in enumerate(sights)
@@ -249,7 +249,7 @@ def _stacked(trees: list[Any]) -> Any:
 
 _sight = jax.jit(sight)
 _pooled = jax.jit(pooled)
-_place = jax.jit(placement.place)
+_place = jax.jit(placing.place)
 
 
 def _without_floor(box: Box, floor: float) -> Box:

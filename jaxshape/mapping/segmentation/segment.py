@@ -17,7 +17,7 @@ from skimage.color import rgb2lab
 from skimage.measure import label
 
 from jaxshape.data.boxes import Box, points_in_box
-from jaxshape.mapping.clusters import (
+from jaxshape.mapping.segmentation.clusters import (
     Pixel,
     Scene,
     background,
@@ -31,7 +31,13 @@ from jaxshape.mapping.clusters import (
     over_footprint,
     reduced,
 )  # fmt: skip
-from jaxshape.mapping.planes import Plane, floor_plane, height_above, subsample, tolerance
+from jaxshape.mapping.segmentation.planes import (
+    Plane,
+    floor_plane,
+    height_above,
+    subsample,
+    tolerance,
+)
 
 SEPARABLE = 0.95
 """Colours tell the object from the floor if they put this share of known pixels where they are."""

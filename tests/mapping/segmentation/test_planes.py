@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxshape.mapping.planes import (
+from jaxshape.mapping.segmentation.planes import (
     NEIGHBOURS,
     Plane,
     camera_points,

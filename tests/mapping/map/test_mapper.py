@@ -8,11 +8,12 @@ from analytic_room import CHAIR, CRATE, FLOOR, TABLE, WALLS, K, room
 from jaxshape.data.boxes import Box
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.camera import Intrinsics
-from jaxshape.mapping import incremental, surfels, tracking
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.incremental import build_mapper
-from jaxshape.mapping.keyframes import Shot
-from jaxshape.mapping.views import view_of
+from jaxshape.mapping.map.mapper import build_mapper
+from jaxshape.mapping.map.state import fused_anew
+from jaxshape.mapping.tracking import registration, surfels
+from jaxshape.mapping.tracking.keyframes import Shot, place_of
+from jaxshape.mapping.tracking.views import view_of
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
@@ -94,7 +95,7 @@ def test_frames_are_tracked_and_become_keyframes_where_they_have_moved(run):
     assert [step.status for step in steps] == ["tracked", "keyframe", "keyframe", "keyframe"]
     assert len(states[-1].keyframes) == 4
     for state, truth in zip(states[1:], POSES[1:], strict=True):
-        metres, degrees = tracking.displacement(state.T_world_camera, truth)
+        metres, degrees = registration.displacement(state.T_world_camera, truth)
         assert metres < 0.015 and degrees < 0.3
     assert set(steps[0].seconds) == {"track"}
     assert set(steps[1].seconds) == {"track", "fuse", "refine"}
@@ -124,7 +125,7 @@ def test_the_map_is_what_all_its_keyframes_measure_at_once(run):
         whole = fusion.merge_all(jax.tree.map(lambda *x: jnp.stack(x), *measured))
         assert_same(fusion.occupied(state.measurement), fusion.occupied(whole))
         assert_same(fusion.occluded(state.measurement), fusion.occluded(whole))
-        anew = incremental.fused_anew(state)
+        anew = fused_anew(state)
         assert_same(anew.measurement, state.measurement)
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-2),
@@ -172,7 +173,7 @@ def test_a_frame_of_garbage_is_lost_and_changes_nothing(mapper, run, name):
     # The next frame is found from where the last one was.
     found, step = mapper.step(after, SHOTS[3])
     assert step.status == "keyframe"
-    assert tracking.displacement(found.T_world_camera, POSES[3])[0] < 0.015
+    assert registration.displacement(found.T_world_camera, POSES[3])[0] < 0.015
 
 
 def test_after_a_gap_the_camera_is_found_again(mapper, run):
@@ -180,7 +181,7 @@ def test_after_a_gap_the_camera_is_found_again(mapper, run):
     state, step = mapper.step(run[0][2], shot(far.depth))  # 40 degrees on
     assert step.status == "keyframe"
     truth = as_pose(far.T_world_camera)
-    metres, degrees = tracking.displacement(state.T_world_camera, truth)
+    metres, degrees = registration.displacement(state.T_world_camera, truth)
     assert metres < 0.03 and degrees < 0.5
 
 
@@ -223,7 +224,7 @@ def test_cells_are_half_a_voxel_wide():
     turn = np.eye(4)
     turn[:3, :3] = jaxlie.SO3.from_y_radians(0.7).as_matrix()
     turn[:3, 3] = 3, 1, -2
-    place = incremental.place_of(Box(turn, np.array([0.5, 0.9, 0.6])), room=0.2)
+    place = place_of(Box(turn, np.array([0.5, 0.9, 0.6])), room=0.2)
     p = np.random.default_rng(0).uniform(-0.2, 0.2, (200, 3))
     voxel = np.asarray(grid.voxel_from_object(place.frame, jnp.float32(p)))
     cell = np.asarray(surfels.cell_of(place.lattice, jnp.float32(p @ turn[:3, :3].T + turn[:3, 3])))

@@ -12,12 +12,12 @@ from jaxtyping import Array, Float
 from jaxshape.geometry import fusion
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import RESOLUTION
-from jaxshape.mapping import surfels
-from jaxshape.mapping.icp import Alignment
-from jaxshape.mapping.keyframes import Keyframe, Place
-from jaxshape.mapping.realign import Odometry, realign
-from jaxshape.mapping.surfels import Lattice, Sums, Surface
-from jaxshape.mapping.views import View
+from jaxshape.mapping.map.realign import Odometry, realign
+from jaxshape.mapping.tracking import surfels
+from jaxshape.mapping.tracking.icp import Alignment
+from jaxshape.mapping.tracking.keyframes import Keyframe, Place
+from jaxshape.mapping.tracking.surfels import Lattice, Sums, Surface
+from jaxshape.mapping.tracking.views import View
 from jaxshape.model.weights import ShapePrior
 
 _CAPACITIES = (8, 16, 32, 64, 128, 256, 512)  # keyframes for which realigning is compiled

@@ -22,11 +22,11 @@ from jaxtyping import Array, Bool, Float
 from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.data.sequences import Frame, Sequence, SequenceError
 from jaxshape.geometry import camera
-from jaxshape.mapping.finding import Start, placed_again, room
-from jaxshape.mapping.incremental import Mapper, Step
-from jaxshape.mapping.keyframes import Keyframe, as_pose, prepare, resized
-from jaxshape.mapping.segmentation import segment_inside
-from jaxshape.mapping.state import State
+from jaxshape.mapping.map.mapper import Mapper, Step
+from jaxshape.mapping.map.state import State
+from jaxshape.mapping.placement.finding import Start, placed_again, room
+from jaxshape.mapping.segmentation.segment import segment_inside
+from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
 from jaxshape.model.weights import ShapePrior
 from jaxshape.search.reconstruction import Reconstruction
 

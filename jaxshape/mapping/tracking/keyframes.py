@@ -15,10 +15,10 @@ from jaxshape.data.sequences import Frame
 from jaxshape.geometry import grid
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.grid import RESOLUTION, GridFrame
-from jaxshape.mapping import icp
-from jaxshape.mapping.icp import Cloud
-from jaxshape.mapping.surfels import CELLS, Lattice
-from jaxshape.mapping.views import View, halved, view_of
+from jaxshape.mapping.tracking import icp
+from jaxshape.mapping.tracking.icp import Cloud
+from jaxshape.mapping.tracking.surfels import CELLS, Lattice
+from jaxshape.mapping.tracking.views import View, halved, view_of
 
 WORKING_WIDTH = 400
 """Images wider than this are halved: tracking needs no more than 320 x 240 pixels."""
