@@ -21,8 +21,8 @@ from jaxshape.geometry import camera
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import Step, build_mapper
 from jaxshape.mapping.tracking import icp, registration
-from jaxshape.mapping.tracking.keyframes import Shot
-from jaxshape.mapping.tracking.views import View, view_of
+from jaxshape.mapping.tracking.keyframes import PreparedFrame
+from jaxshape.mapping.tracking.views import DepthView, view_of
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
@@ -96,12 +96,12 @@ def our_ways() -> tuple[dict[str, Variant], float]:
     lens, flat = intrinsics(), jnp.ones((HEIGHT, WIDTH))
     prepare, seconds = compiled(view_of, flat, lens)
 
-    def one(reference: View, frame: View) -> jax.Array:
+    def one(reference: DepthView, frame: DepthView) -> jax.Array:
         match = icp.match_view(reference, still)
         found = registration.register(frame, everything, match, still)
         return found.T_reference_source.as_matrix()
 
-    def many(reference: View, frame: View) -> jax.Array:
+    def many(reference: DepthView, frame: DepthView) -> jax.Array:
         match = icp.match_view(reference, still)
         guesses = registration.guesses(still, jnp.array([0.0, 0.0, DISTANCE]))
         found = registration.register_from(frame, everything, match, guesses)
@@ -267,8 +267,8 @@ def _mapper():
     return build_mapper(prior, refiner, search, settings, TrackingConfig())
 
 
-def _shot(depth: np.ndarray) -> Shot:
-    return Shot(_view_of(jnp.asarray(depth), intrinsics()), jnp.ones(depth.shape, bool))
+def _shot(depth: np.ndarray) -> PreparedFrame:
+    return PreparedFrame(_view_of(jnp.asarray(depth), intrinsics()), jnp.ones(depth.shape, bool))
 
 
 _view_of = jax.jit(view_of)

@@ -11,7 +11,7 @@ from .mapping.map.recording import Progress, follow, trajectory
 from .mapping.placement.finding import find_start
 from .mapping.placement.placing import Placement, PlacementConfig, place
 from .mapping.segmentation.segment import Prompt, Segmentation, segment
-from .mapping.tracking.keyframes import Shot
+from .mapping.tracking.keyframes import PreparedFrame
 from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
 from .model.config import Architecture
 from .model.weights import ShapePrior, load_prior, save_prior
@@ -59,7 +59,7 @@ __all__ = [
     "Refiner",
     "Segmentation",
     "ShapePrior",
-    "Shot",
+    "PreparedFrame",
     "StopReason",
     "Target",
     "Tolerances",

@@ -23,7 +23,7 @@ from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.data.sequences import Frame, Sequence, SequenceError
 from jaxshape.geometry import camera
 from jaxshape.mapping.map.mapper import Mapper, Step
-from jaxshape.mapping.map.state import State
+from jaxshape.mapping.map.state import MapState
 from jaxshape.mapping.placement.finding import Start, placed_again, room
 from jaxshape.mapping.segmentation.segment import segment_inside
 from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
@@ -53,7 +53,7 @@ class FrameLog(NamedTuple):
 class Progress(NamedTuple):
     """A map and what became of the frames so far."""
 
-    state: State
+    state: MapState
     start: Start
     logs: tuple[FrameLog, ...]
     shape: Reconstruction | None = None
@@ -89,9 +89,13 @@ def follow(
 
 def _begin(sequence: Sequence, start: Start, mapper: Mapper, use_poses: bool) -> Progress:
     frame = sequence[start.index]
-    shot = prepare(frame, sequence.intrinsics, start.masked)
+    prepared = prepare(frame, sequence.intrinsics, start.masked)
     state, step = mapper.init(
-        shot, start.box, as_pose(start.T_world_camera), room=room(start), poses_are_given=use_poses
+        prepared,
+        start.box,
+        as_pose(start.T_world_camera),
+        room=room(start),
+        poses_are_given=use_poses,
     )
     log = FrameLog(start.index, frame.name, "keyframe", "", 0, np.eye(4), _figures(step))
     return Progress(state, start, (log,), step.shape)
@@ -109,11 +113,11 @@ def _next(
         log = FrameLog(index, name, "unreadable", str(problem), last, None, {})
         return progress._replace(logs=(*logs, log))
     given = frame.T_world_camera if use_poses else None
-    shot = prepare(frame, sequence.intrinsics)
+    prepared = prepare(frame, sequence.intrinsics)
     # A mask, or a box that was given, says what is the object; one that was found is not sure.
     is_estimated = progress.start.T_level_world is not None and frame.mask is None
     cut = partial(_cut, frame, sequence, state.keyframes) if is_estimated else None
-    state, step = mapper.step(state, shot, None if given is None else as_pose(given), cut)
+    state, step = mapper.step(state, prepared, None if given is None else as_pose(given), cut)
     relative = None
     if step.T_world_camera is not None:
         keyframe = state.keyframes[-1].T_world_camera

@@ -17,13 +17,13 @@ from jaxshape.mapping.tracking import surfels
 from jaxshape.mapping.tracking.icp import Alignment
 from jaxshape.mapping.tracking.keyframes import Keyframe, Place
 from jaxshape.mapping.tracking.surfels import Lattice, Sums, Surface
-from jaxshape.mapping.tracking.views import View
+from jaxshape.mapping.tracking.views import DepthView
 from jaxshape.model.weights import ShapePrior
 
-_CAPACITIES = (8, 16, 32, 64, 128, 256, 512)  # keyframes for which realigning is compiled
+_LEAST_CAPACITY = 8  # keyframes for which realigning is compiled, even where there are fewer
 
 
-class State(NamedTuple):
+class MapState(NamedTuple):
     """All that the next step needs."""
 
     keyframes: tuple[Keyframe, ...]
@@ -36,7 +36,7 @@ class State(NamedTuple):
     """Its decoded shape; -inf before anything was measured."""
     surface: Surface
     """What frames are tracked against."""
-    view: View
+    view: DepthView
     """Of the last keyframe."""
     T_world_camera: jaxlie.SE3
     """Of the last frame that was tracked."""
@@ -49,20 +49,20 @@ def assemble(
     prior: ShapePrior,
     place: Place,
     keyframes: tuple[Keyframe, ...],
-    view: View,
+    view: DepthView,
     *,
     code: Float[Array, " d"] | None = None,
     logits: Float[Array, "x y z"] | None = None,
     T_world_camera: jaxlie.SE3 | None = None,
     T_before_last: jaxlie.SE3 | None = None,
     poses_are_given: bool = False,
-) -> State:
+) -> MapState:
     """The state of a map with these keyframes, of whose last one `view` is.
 
     `code` and `logits` are those of the shape found so far, `T_world_camera` the pose of the last
     frame that was tracked and `T_before_last` the motion before it, where there was one since.
     """
-    state = State(
+    state = MapState(
         keyframes=keyframes,
         place=place,
         measurement=fusion.nothing_measured(),
@@ -78,7 +78,7 @@ def assemble(
     return with_surface(fused_anew(state))
 
 
-def fused_anew(state: State) -> State:
+def fused_anew(state: MapState) -> MapState:
     """The state with F, M and the measured surface made from all keyframes where they are now."""
     state = state._replace(measurement=fusion.nothing_measured(), sums=surfels.no_sums())
     for keyframe in state.keyframes:
@@ -86,7 +86,7 @@ def fused_anew(state: State) -> State:
     return state
 
 
-def added(state: State, keyframe: Keyframe) -> State:
+def added(state: MapState, keyframe: Keyframe) -> MapState:
     """The state with one more keyframe fused into F, M and the measured surface."""
     T_object_world = jaxlie.SE3.from_matrix(
         jnp.float32(np.linalg.inv(state.place.box.T_world_object))
@@ -117,7 +117,7 @@ def grids_of(measurement: Measurement, min_hits: int):
 
 
 def odometry_of(
-    state: State, T: jaxlie.SE3, alignment: Alignment | None
+    state: MapState, T: jaxlie.SE3, alignment: Alignment | None
 ) -> tuple[jaxlie.SE3, Float[Array, "6 6"]]:
     """The new keyframe relative to the last, and the information of that."""
     T_last = state.keyframes[-1].T_world_camera
@@ -128,10 +128,30 @@ def odometry_of(
     return (T_last.inverse() @ T).normalize(), information
 
 
-def realigned_poses(state: State) -> list[jaxlie.SE3]:
+def realigned(state: MapState) -> MapState:
+    """The state with all keyframes moved to where they agree with each other and with the shape.
+
+    Args:
+        state: A map of at least one keyframe, with its shape refined.
+
+    Returns:
+        The map with new poses, fused anew; the last tracked frame moves with the last keyframe.
+    """
+    T = realigned_poses(state)
+    moved = (T[-1] @ state.keyframes[-1].T_world_camera.inverse()).normalize()
+    keyframes = tuple(
+        one._replace(T_world_camera=pose) for one, pose in zip(state.keyframes, T, strict=True)
+    )
+    state = state._replace(
+        keyframes=keyframes, T_world_camera=(moved @ state.T_world_camera).normalize()
+    )
+    return with_surface(fused_anew(state))
+
+
+def realigned_poses(state: MapState) -> list[jaxlie.SE3]:
     """Where the keyframes agree best with each other and with the refined shape."""
     count = len(state.keyframes)
-    capacity = next(n for n in _CAPACITIES if n >= count)
+    capacity = capacity_for(count)
     filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - count)]
     clouds, T, T_previous, information = jax.tree.map(
         lambda *x: jnp.stack(x),
@@ -147,6 +167,19 @@ def realigned_poses(state: State) -> list[jaxlie.SE3]:
     return [jaxlie.SE3(T.wxyz_xyz[i]) for i in range(count)]
 
 
+def capacity_for(count: int) -> int:
+    """The number of keyframes for which realigning is compiled: the next power of two.
+
+    Args:
+        count: How many there are, 1 or more.
+
+    Returns:
+        8, 16, 32, ...: with each twice as large as the one before, a map that grows is compiled
+        for a few times only.
+    """
+    return max(_LEAST_CAPACITY, 1 << (count - 1).bit_length())
+
+
 @jax.jit
 def _realign(clouds, T, is_keyframe, lattice, probability, odometry, is_fixed, center):
     # About the object, so that rotations have short arms and positions keep their digits.
@@ -157,7 +190,7 @@ def _realign(clouds, T, is_keyframe, lattice, probability, odometry, is_fixed, c
     return to_near.inverse() @ T
 
 
-def with_surface(state: State) -> State:
+def with_surface(state: MapState) -> MapState:
     """The state with the surface that frames are tracked against: measured, else predicted."""
     surface = _composed_surface(state.place.lattice, state.sums, jax.nn.sigmoid(state.logits))
     return state._replace(surface=surface)

@@ -15,7 +15,7 @@ from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Frame, Sequence, SequenceError
 from jaxshape.mapping.placement import placing
 from jaxshape.mapping.placement.placing import Placement
-from jaxshape.mapping.placement.rays import pooled, sight
+from jaxshape.mapping.placement.rays import pooled, sample_rays
 from jaxshape.mapping.segmentation.planes import Floor, camera_points, dominant_planes, floor_plane
 from jaxshape.mapping.segmentation.segment import Prompt, Segmentation, segment
 from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
@@ -144,7 +144,7 @@ def _place_first(
     doubts = [cut] * (found.confidence < SURE) + [of_up] * (floor is None)
     T_level_world = np.eye(4)
     T_level_world[:3, :3] = _rotation_onto_y(up)
-    shot = prepare(frame, sequence.intrinsics)
+    prepared = prepare(frame, sequence.intrinsics)
     start = Start(
         index=index,
         masked=found.segmented,
@@ -156,9 +156,9 @@ def _place_first(
         notes=(cut, of_up),
         warnings=tuple(doubts),
     )
-    masked = resized(found.segmented, shot.view.depth.shape)
-    sights = [(shot.view.depth, masked, shot.view.intrinsics, T_world_camera)]
-    start = _placed(start, prior, sights)
+    masked = resized(found.segmented, prepared.view.depth.shape)
+    seen = (prepared.view.depth, masked, prepared.view.intrinsics, T_world_camera)
+    start = _placed(start, prior, [seen])
     if start.placement is None:
         raise SequenceError(
             f"{frame.name}: the object was cut out, but too little of it to place it; give another "
@@ -218,22 +218,22 @@ def _rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
 
 def placed_again(start: Start, prior: ShapePrior, keyframes: tuple[Keyframe, ...]) -> Start:
     """The start with its box estimated from all keyframes, from its earlier placement on."""
-    sights = [
+    seen = [
         (one.depth, one.segmented, one.intrinsics, np.asarray(one.T_world_camera.as_matrix()))
         for one in keyframes
     ]
-    return _placed(start, prior, sights)
+    return _placed(start, prior, seen)
 
 
-def _placed(start: Start, prior: ShapePrior, sights: list) -> Start:
+def _placed(start: Start, prior: ShapePrior, frames: list) -> Start:
     """The start with the box that the prior finds; as it is where nothing can be placed."""
     assert start.T_level_world is not None
     known = start.placement or placing.nothing_known(prior)
     each = [
-        _sight(jax.random.key(number), depth, masked, intrinsics)
-        for number, (depth, masked, intrinsics, _) in enumerate(sights)
+        _sample_rays(jax.random.key(number), depth, masked, intrinsics)
+        for number, (depth, masked, intrinsics, _) in enumerate(frames)
     ]
-    poses = [as_pose(start.T_level_world @ T_world_camera) for *_, T_world_camera in sights]
+    poses = [as_pose(start.T_level_world @ T_world_camera) for *_, T_world_camera in frames]
     seen = _pooled(_stacked(each), _stacked(poses))
     found = _place(prior, seen, jnp.float32(start.floor), known)
     if not np.isfinite(found.misfit):
@@ -247,7 +247,7 @@ def _stacked(trees: list[Any]) -> Any:
     return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
-_sight = jax.jit(sight)
+_sample_rays = jax.jit(sample_rays)
 _pooled = jax.jit(pooled)
 _place = jax.jit(placing.place)
 

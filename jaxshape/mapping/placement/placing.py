@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
-from jaxshape.mapping.placement.rays import Sight
+from jaxshape.mapping.placement.rays import RaySamples
 from jaxshape.model.autoencoder import decode, encode, prepare_decoder
 from jaxshape.model.weights import ShapePrior
 from jaxshape.search.batching import select
@@ -80,7 +80,7 @@ OTHERWISE = jnp.pi / 6
 """Yaws further apart than this, in radians, are different answers."""
 
 
-class Box(NamedTuple):
+class UprightBox(NamedTuple):
     """An upright box: its corners in a frame that is turned by `yaw`, in radians, about +y."""
 
     yaw: Float[Array, "*batch"]
@@ -91,7 +91,7 @@ class Box(NamedTuple):
 class Hypothesis(NamedTuple):
     """A box and the shape in it."""
 
-    box: Box
+    box: UprightBox
     point: Float[Array, "*batch d"]
     """Of the code, in the whitened space."""
 
@@ -116,7 +116,7 @@ class Placement(NamedTuple):
 # ------------------------------------------------------------------------ boxes
 
 
-def propose(seen: Sight, floor: Float[Array, ""], config: PlacementConfig) -> Box:
+def propose(seen: RaySamples, floor: Float[Array, ""], config: PlacementConfig) -> UprightBox:
     """Boxes around the measured points: `overhangs * yaws` of them, yaw by yaw.
 
     A side that faces the camera lies where the points end, one that faces away may lie beyond. The
@@ -132,11 +132,11 @@ def propose(seen: Sight, floor: Float[Array, ""], config: PlacementConfig) -> Bo
     overhang = typical * jnp.array(config.overhangs)[:, None, None]
     lower = lower - overhang * jnp.minimum(away, 0) ** 2
     upper = upper + overhang * jnp.maximum(away, 0) ** 2
-    boxes = Box(jnp.broadcast_to(yaw, lower.shape[:2]), lower, upper)
+    boxes = UprightBox(jnp.broadcast_to(yaw, lower.shape[:2]), lower, upper)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), _standing(boxes, floor))
 
 
-def _standing(box: Box, floor: Float[Array, ""]) -> Box:
+def _standing(box: UprightBox, floor: Float[Array, ""]) -> UprightBox:
     """The box with its bottom on the floor, where that is known."""
     bottom = jnp.where(jnp.isnan(floor), box.lower[..., 1], floor)
     return box._replace(lower=box.lower.at[..., 1].set(bottom))
@@ -147,7 +147,7 @@ def turn(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
     return jaxlie.SO3.from_y_radians(yaw).as_matrix()
 
 
-def to_voxels(box: Box, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+def to_voxels(box: UprightBox, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Points in the voxel coordinates of the grid that the box fills."""
     return grid.voxel_from_object(grid.fit_box(box.lower, box.upper), points @ turn(box.yaw))
 
@@ -156,7 +156,7 @@ def to_voxels(box: Box, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
 
 
 def misfit(
-    logits: Float[Array, "x y z"], box: Box, seen: Sight, config: PlacementConfig
+    logits: Float[Array, "x y z"], box: UprightBox, seen: RaySamples, config: PlacementConfig
 ) -> Float[Array, ""]:
     """How badly a shape in a box explains what was seen, in nats per point.
 
@@ -229,7 +229,7 @@ def improve(
 
 def place(
     prior: ShapePrior,
-    seen: Sight,
+    seen: RaySamples,
     floor: Float[Array, ""],
     known: Placement,
     config: PlacementConfig = PlacementConfig(),
@@ -265,7 +265,7 @@ def place(
 
     width = 0.015 * jnp.array(config.typical_size)
     on_floor = width.at[1].multiply(jnp.isnan(floor))
-    unit = Hypothesis(Box(jnp.float32(0.02), on_floor, width), jnp.float32(0.1))
+    unit = Hypothesis(UprightBox(jnp.float32(0.02), on_floor, width), jnp.float32(0.1))
     steps = jnp.where(jnp.isnan(known.misfit), config.steps, config.steps_again)
     improved = improve(start, misfits, unit, steps)
     before, after = first[chosen], finite_or_inf(misfits(improved))
@@ -280,11 +280,11 @@ def nothing_known(prior: ShapePrior) -> Placement:
     return Placement(unknown, jnp.full(3, nan), jnp.full_like(prior.code_mean, nan), nan, nan)
 
 
-def _box_of(known: Placement, center: Float[Array, " 3"]) -> Box:
+def _box_of(known: Placement, center: Float[Array, " 3"]) -> UprightBox:
     front = known.T_world_object.rotation() @ jnp.array([0.0, 0.0, 1.0])
     yaw = jnp.arctan2(front[0], front[2])
     middle = (known.T_world_object.translation() - center) @ turn(yaw)
-    return Box(yaw, middle - known.size / 2, middle + known.size / 2)
+    return UprightBox(yaw, middle - known.size / 2, middle + known.size / 2)
 
 
 def _most_promising(misfits: Float[Array, " h"], config: PlacementConfig) -> Int[Array, " k"]:

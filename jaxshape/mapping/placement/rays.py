@@ -15,7 +15,7 @@ from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
 
 SURFACE_POINTS, FREE_POINTS = 8192, 4096
-"""Of a sight: enough points on the object to fill a grid, and points that rays passed through."""
+"""Of each frame: points on the object, enough to fill a grid, and points that rays passed."""
 
 REACH = 1.2
 """Radius of the ball around the object in which rays count, in typical extents."""
@@ -25,7 +25,7 @@ FREE_GAP = 0.06
 and the thickness of a voxel."""
 
 
-class Sight(NamedTuple):
+class RaySamples(NamedTuple):
     """What depth frames say of the place of an object."""
 
     surface: Float[Array, "*batch n 3"]
@@ -37,13 +37,13 @@ class Sight(NamedTuple):
     vectors, so that it is short where the object was seen from all sides."""
 
 
-def sight(
+def sample_rays(
     key: Key[Array, ""],
     depth: Float[Array, "h w"],
     segmented: Bool[Array, "h w"],
     intrinsics: Intrinsics,
     extent: float = 0.7,
-) -> Sight:
+) -> RaySamples:
     """What one frame says, in the frame of its camera; the same number of points for every frame.
 
     `depth` is in metres, 0 where nothing is known and infinite where the ray met nothing;
@@ -63,7 +63,7 @@ def sight(
     length = jnp.where(jnp.isnan(center[0]), 0, jnp.maximum(far - near, 0))
     ray = _draw(ray_key, jnp.int32(length / (REACH * extent) * 500), FREE_POINTS)
     z = near[ray] + length[ray] * jax.random.uniform(depth_key, ray.shape)
-    return Sight(
+    return RaySamples(
         surface=points[_draw(surface_key, jnp.int32(is_object), SURFACE_POINTS)],
         free=rays[ray] * z[:, None],
         away=center / jnp.linalg.norm(center),
@@ -90,12 +90,12 @@ def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Arra
     return jnp.searchsorted(total, mark, side="right")
 
 
-def pooled(sights: Sight, T_world_camera: jaxlie.SE3) -> Sight:
+def pooled(samples: RaySamples, T_world_camera: jaxlie.SE3) -> RaySamples:
     """What the frames of a leading axis say together, in the world, in as many points as of one.
 
     Frames in which nothing was segmented are left out.
     """
-    is_empty = jnp.isnan(sights.away[:, 0])
+    is_empty = jnp.isnan(samples.away[:, 0])
     frames = jnp.argsort(is_empty)  # the others first
     count = jnp.maximum(jnp.sum(~is_empty), 1)
 
@@ -104,5 +104,5 @@ def pooled(sights: Sight, T_world_camera: jaxlie.SE3) -> Sight:
         place = jnp.arange(points.shape[1])
         return points[frames[place % count], place]  # which are in random order
 
-    away = jnp.nanmean(T_world_camera.rotation() @ sights.away, axis=0)
-    return Sight(some_of_each(sights.surface), some_of_each(sights.free), away)
+    away = jnp.nanmean(T_world_camera.rotation() @ samples.away, axis=0)
+    return RaySamples(some_of_each(samples.surface), some_of_each(samples.free), away)

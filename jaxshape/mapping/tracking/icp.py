@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.geometry import camera
-from jaxshape.mapping.tracking.views import View, depth_deviation, is_oriented
+from jaxshape.mapping.tracking.views import DepthView, depth_deviation, is_oriented
 
 CUTOFF = 4.0
 """Standard deviations beyond which a residual has no weight (Tukey's function)."""
@@ -75,7 +75,9 @@ class Alignment(NamedTuple):
     iterations: Int[Array, ""]
 
 
-def cloud_of(view: View, segmented: Bool[Array, "h w"] | None = None, stride: int = 1) -> Cloud:
+def cloud_of(
+    view: DepthView, segmented: Bool[Array, "h w"] | None = None, stride: int = 1
+) -> Cloud:
     """The oriented points of every `stride`-th pixel, of those segmented if that is given."""
     known = is_oriented(view) if segmented is None else is_oriented(view) & segmented
     points, normals, known = (
@@ -85,7 +87,7 @@ def cloud_of(view: View, segmented: Bool[Array, "h w"] | None = None, stride: in
     return Cloud(points.reshape(-1, 3), normals.reshape(-1, 3), deviation.ravel())
 
 
-def match_view(view: View, T_reference_camera: jaxlie.SE3) -> Match:
+def match_view(view: DepthView, T_reference_camera: jaxlie.SE3) -> Match:
     """Match points with what a view shows at the pixel into which they fall.
 
     A point in front of the view's surface, or where its rays met nothing, should have been seen;

@@ -18,7 +18,7 @@ from jaxshape.geometry.grid import RESOLUTION, GridFrame
 from jaxshape.mapping.tracking import icp
 from jaxshape.mapping.tracking.icp import Cloud
 from jaxshape.mapping.tracking.surfels import CELLS, Lattice
-from jaxshape.mapping.tracking.views import View, halved, view_of
+from jaxshape.mapping.tracking.views import DepthView, halved, view_of
 
 WORKING_WIDTH = 400
 """Images wider than this are halved: tracking needs no more than 320 x 240 pixels."""
@@ -26,10 +26,10 @@ WORKING_WIDTH = 400
 _STRIDE = 2  # pixels between the points that a keyframe keeps
 
 
-class Shot(NamedTuple):
+class PreparedFrame(NamedTuple):
     """One frame, prepared for tracking and mapping."""
 
-    view: View
+    view: DepthView
     masked: Bool[Array, "h w"]
     """Pixels that may show the object: a given mask, or all."""
 
@@ -82,23 +82,34 @@ def place_of(box: Box, room: float = 0.0, *, isotropic: bool = False) -> Place:
 
 
 def keyframe_of(
-    shot: Shot,
+    prepared: PreparedFrame,
     place: Place,
     T_world_camera: jaxlie.SE3,
     odometry: tuple[jaxlie.SE3, Float[Array, "6 6"]] | None,
     segmented: Bool[Array, "h w"] | None = None,
 ) -> Keyframe:
-    """What the map keeps of a shot; `odometry` is its pose relative to the keyframe before, and the
-    information of that. The object's pixels are those in its box, unless they are given."""
+    """What the map keeps of a frame.
+
+    Args:
+        prepared: The frame.
+        place: Where the object's grids lie.
+        T_world_camera: The pose of the frame.
+        odometry: Its pose relative to the keyframe before, and the information of that; None for
+            the first.
+        segmented: The object's pixels; those in its box where they are not given.
+
+    Returns:
+        The keyframe.
+    """
     if segmented is None:
-        segmented = object_pixels(shot, place, T_world_camera)
+        segmented = object_pixels(prepared, place, T_world_camera)
     T_previous, information = odometry or (jaxlie.SE3.identity(), jnp.zeros((6, 6)))
     return Keyframe(
-        depth=shot.view.depth,
-        masked=shot.masked,
+        depth=prepared.view.depth,
+        masked=prepared.masked,
         segmented=segmented,
-        intrinsics=shot.view.intrinsics,
-        cloud=_cloud(shot.view, segmented),
+        intrinsics=prepared.view.intrinsics,
+        cloud=_cloud(prepared.view, segmented),
         T_world_camera=T_world_camera,
         T_previous_keyframe=T_previous,
         information=information,
@@ -107,17 +118,19 @@ def keyframe_of(
 
 def cut_anew(keyframe: Keyframe, place: Place) -> Keyframe:
     """The keyframe with the object cut out of it by another box."""
-    shot = Shot(view_again(keyframe.depth, keyframe.intrinsics), keyframe.masked)
-    segmented = object_pixels(shot, place, keyframe.T_world_camera)
-    return keyframe._replace(segmented=segmented, cloud=_cloud(shot.view, segmented))
+    prepared = PreparedFrame(view_again(keyframe.depth, keyframe.intrinsics), keyframe.masked)
+    segmented = object_pixels(prepared, place, keyframe.T_world_camera)
+    return keyframe._replace(segmented=segmented, cloud=_cloud(prepared.view, segmented))
 
 
-def object_pixels(shot: Shot, place: Place, T_world_camera: jaxlie.SE3) -> Bool[Array, "h w"]:
+def object_pixels(
+    prepared: PreparedFrame, place: Place, T_world_camera: jaxlie.SE3
+) -> Bool[Array, "h w"]:
     """Pixels that may show the object and whose points lie in its box."""
     T = np.asarray(T_world_camera.as_matrix(), np.float64)
-    points = np.asarray(shot.view.points, np.float64) @ T[:3, :3].T + T[:3, 3]
-    inside = points_in_box(points, place.cut) & (np.asarray(shot.view.points[..., 2]) > 0)
-    return shot.masked & inside
+    points = np.asarray(prepared.view.points, np.float64) @ T[:3, :3].T + T[:3, 3]
+    inside = points_in_box(points, place.cut) & (np.asarray(prepared.view.points[..., 2]) > 0)
+    return prepared.masked & inside
 
 
 _cloud = jax.jit(partial(icp.cloud_of, stride=_STRIDE))
@@ -130,7 +143,7 @@ view_again = jax.jit(view_of)
 
 def prepare(
     frame: Frame, K: Float[np.ndarray, "3 3"], masked: Bool[np.ndarray, "h w"] | None = None
-) -> Shot:
+) -> PreparedFrame:
     """A frame at working size, with its oriented points; `masked` in place of its own mask."""
     intrinsics = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
     halvings = 0
@@ -139,8 +152,8 @@ def prepare(
     view = _view(jnp.asarray(frame.depth), intrinsics, halvings)
     mask = frame.mask if masked is None else masked
     if mask is None:
-        return Shot(view, jnp.ones(view.depth.shape, bool))
-    return Shot(view, resized(mask, view.depth.shape))
+        return PreparedFrame(view, jnp.ones(view.depth.shape, bool))
+    return PreparedFrame(view, resized(mask, view.depth.shape))
 
 
 @partial(jax.jit, static_argnums=2)

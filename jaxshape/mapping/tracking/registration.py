@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.mapping.config import TrackingConfig
 from jaxshape.mapping.tracking.icp import Alignment, Match, align, cloud_of
-from jaxshape.mapping.tracking.views import View
+from jaxshape.mapping.tracking.views import DepthView
 
 
 class Level(NamedTuple):
@@ -34,14 +34,14 @@ LEVELS = (
 
 
 def register(
-    view: View, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
+    view: DepthView, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
 ) -> Alignment:
     """Align the segmented pixels of a view with a reference, coarse to fine, from one guess."""
     return _descend(view, segmented, match, T_reference_camera, LEVELS)
 
 
 def register_from(
-    view: View, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
+    view: DepthView, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
 ) -> Alignment:
     """Align a view from many guesses, a batch of poses; the one that explains most goes on."""
     coarse = LEVELS[0]
@@ -89,16 +89,29 @@ def guesses(
     return jaxlie.SE3.from_rotation_and_translation(rotation, shift) @ T_world_camera
 
 
-def doubt(alignment: Alignment, T_expected: jaxlie.SE3, config: TrackingConfig) -> str | None:
-    """Why a pose should not be believed, in a few words; None where it should. [host]"""
-    distance, angle = displacement(alignment.T_reference_source, T_expected)
+def doubt(
+    alignment: Alignment, T_expected: jaxlie.SE3 | None, config: TrackingConfig
+) -> str | None:
+    """Why a pose should not be believed. [host]
+
+    Args:
+        alignment: How the frame was registered.
+        T_expected: The pose it was expected at; None where it may lie anywhere.
+        config: How much must be explained, and how far from the expected pose it may lie.
+
+    Returns:
+        A few words; None where the pose should be believed.
+    """
+    T = alignment.T_reference_source
+    distance, angle = displacement(T, T if T_expected is None else T_expected)
     if not np.isfinite(distance + angle):
         return "no pose was found"
     if alignment.overlap < config.min_overlap:
         return f"only {float(alignment.overlap):.0%} of it is seen again"
     if alignment.inlier_fraction < config.min_inliers:
         return f"only {float(alignment.inlier_fraction):.0%} of what is seen again agrees"
-    if distance > config.max_distance or angle > config.max_angle:
+    has_jumped = distance > config.max_distance or angle > config.max_angle
+    if T_expected is not None and has_jumped:
         return f"it jumped by {distance:.2f} m and {angle:.0f} degrees"
     return None
 

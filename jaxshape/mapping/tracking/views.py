@@ -18,7 +18,7 @@ JUMP = 0.03
 _TAPS = (0.06, 0.25, 0.38, 0.25, 0.06)  # of the smoothing, along each axis
 
 
-class View(NamedTuple):
+class DepthView(NamedTuple):
     """A depth image, and the oriented points it measures, in the frame of its camera."""
 
     depth: Float[Array, "h w"]
@@ -38,15 +38,15 @@ def depth_deviation(depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return jnp.maximum(1.6e-3 * depth**2, 5e-4)
 
 
-def view_of(depth: Float[Array, "h w"], intrinsics: Intrinsics) -> View:
+def view_of(depth: Float[Array, "h w"], intrinsics: Intrinsics) -> DepthView:
     """The oriented points of a depth image in metres."""
     known = jnp.where(jnp.isfinite(depth), depth, 0)
     smooth = _smooth_rows(_smooth_rows(known).T).T
     points = camera.unproject(intrinsics, smooth)
-    return View(depth, points, _normals(points), intrinsics)
+    return DepthView(depth, points, _normals(points), intrinsics)
 
 
-def is_oriented(view: View) -> Bool[Array, "h w"]:
+def is_oriented(view: DepthView) -> Bool[Array, "h w"]:
     """Pixels whose point and normal are both known."""
     return jnp.any(view.normals != 0, axis=-1)
 

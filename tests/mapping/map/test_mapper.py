@@ -12,7 +12,7 @@ from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import build_mapper
 from jaxshape.mapping.map.state import fused_anew
 from jaxshape.mapping.tracking import registration, surfels
-from jaxshape.mapping.tracking.keyframes import Shot, place_of
+from jaxshape.mapping.tracking.keyframes import PreparedFrame, place_of
 from jaxshape.mapping.tracking.views import view_of
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
@@ -32,7 +32,7 @@ def seen_from(azimuth, seed=0):
 
 
 def shot(depth):
-    return Shot(prepare(jnp.float32(depth), LENS), jnp.ones(depth.shape, bool))
+    return PreparedFrame(prepare(jnp.float32(depth), LENS), jnp.ones(depth.shape, bool))
 
 
 def as_pose(T):

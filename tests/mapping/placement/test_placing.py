@@ -15,8 +15,14 @@ from jaxshape.data.chairs import random_chair
 from jaxshape.data.render import add_sensor_noise, fit_intrinsics, render_depth
 from jaxshape.geometry import camera
 from jaxshape.mapping.placement import placing
-from jaxshape.mapping.placement.placing import Box, Hypothesis, PlacementConfig
-from jaxshape.mapping.placement.rays import FREE_POINTS, SURFACE_POINTS, Sight, pooled, sight
+from jaxshape.mapping.placement.placing import Hypothesis, PlacementConfig, UprightBox
+from jaxshape.mapping.placement.rays import (
+    FREE_POINTS,
+    SURFACE_POINTS,
+    RaySamples,
+    pooled,
+    sample_rays,
+)
 from jaxshape.model.weights import load_prior
 
 CONFIG = PlacementConfig(yaws=12, overhangs=(0.0, 0.35), kept=4, steps=30, steps_again=10)
@@ -31,20 +37,20 @@ def smooth_logits():
     return 2 * jnp.sin(x + y) * jnp.cos(z - 0.5 * y)
 
 
-def random_sight(seed=0, surface=40, free=30):
+def random_samples(seed=0, surface=40, free=30):
     rng = np.random.default_rng(seed)
     points = lambda n, reach: jnp.asarray(rng.uniform(-reach, reach, (n, 3)))  # noqa: E731
-    return Sight(points(surface, 0.3), points(free, 0.5), jnp.array([0.6, 0.0, -0.8]))
+    return RaySamples(points(surface, 0.3), points(free, 0.5), jnp.array([0.6, 0.0, -0.8]))
 
 
-BOX = Box(jnp.array(0.4), jnp.array([-0.31, -0.3, -0.33]), jnp.array([0.35, 0.36, 0.29]))
+BOX = UprightBox(jnp.array(0.4), jnp.array([-0.31, -0.3, -0.33]), jnp.array([0.35, 0.36, 0.29]))
 
 
 # ------------------------------------------------------------------------ boxes
 
 
 def test_boxes_hold_the_points_stand_on_the_floor_and_reach_away_from_the_camera():
-    seen = random_sight(surface=SURFACE_POINTS)
+    seen = random_samples(surface=SURFACE_POINTS)
     boxes = placing.propose(seen, jnp.array(-0.7), CONFIG)
     assert len(boxes.yaw) == CONFIG.yaws * len(CONFIG.overhangs)
     np.testing.assert_allclose(boxes.lower[:, 1], -0.7)
@@ -101,7 +107,7 @@ def slow_misfit(logits, box, seen, config):
 
 
 def test_misfit_agrees_with_a_slow_reference():
-    seen = random_sight()
+    seen = random_samples()
     fast = placing.misfit(smooth_logits(), BOX, seen, CONFIG)
     np.testing.assert_allclose(fast, slow_misfit(smooth_logits(), BOX, seen, CONFIG), rtol=1e-4)
 
@@ -109,7 +115,7 @@ def test_misfit_agrees_with_a_slow_reference():
 def test_misfit_has_the_right_gradient():
     with jax.enable_x64(True):
         widen = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tree)  # noqa: E731
-        logits, box, seen = widen((smooth_logits(), BOX, random_sight()))
+        logits, box, seen = widen((smooth_logits(), BOX, random_samples()))
         loss = jax.jit(lambda logits, box: placing.misfit(logits, box, seen, CONFIG))
         check_grads(loss, (logits, box), order=1, modes=["rev"], eps=1e-6, rtol=1e-4)
 
@@ -117,10 +123,10 @@ def test_misfit_has_the_right_gradient():
 def test_misfit_depends_on_neither_units_nor_the_world():
     """Everything twice as large, or all turned, explains as much."""
     twice = PlacementConfig(typical_size=tuple(2 * x for x in CONFIG.typical_size))
-    seen, logits = random_sight(), smooth_logits()
+    seen, logits = random_samples(), smooth_logits()
     expected = placing.misfit(logits, BOX, seen, CONFIG)
     double = lambda x: 2 * x  # noqa: E731
-    box = Box(BOX.yaw, 2 * BOX.lower, 2 * BOX.upper)
+    box = UprightBox(BOX.yaw, 2 * BOX.lower, 2 * BOX.upper)
     scaled = placing.misfit(logits, box, jax.tree.map(double, seen), twice)
     np.testing.assert_allclose(scaled, expected, rtol=1e-4)
     R = placing.turn(jnp.array(1.1))
@@ -141,10 +147,10 @@ def quadratic(hypothesis):
 def hypotheses(count):
     rng = np.random.default_rng(1)
     draw = lambda *shape: jnp.asarray(rng.normal(size=(count, *shape)), jnp.float32)  # noqa: E731
-    return Hypothesis(Box(draw(), draw(3), draw(3)), draw(5))
+    return Hypothesis(UprightBox(draw(), draw(3), draw(3)), draw(5))
 
 
-UNIT = Hypothesis(Box(*jnp.full(3, 0.1)), jnp.float32(0.1))
+UNIT = Hypothesis(UprightBox(*jnp.full(3, 0.1)), jnp.float32(0.1))
 
 
 def test_hypotheses_are_improved_each_on_its_own():
@@ -201,7 +207,7 @@ def look(mesh, azimuth, elevation=25.0, distance=2.0):
     depth, cosine = render_depth(mesh, T, intrinsics, IMAGE_SIZE)
     depth = add_sensor_noise(depth, cosine, np.random.default_rng(0))
     depth, segmented = jnp.asarray(depth[0]), jnp.asarray(np.isfinite(depth[0]) & (depth[0] > 0))
-    seen = jax.jit(sight)(jax.random.key(0), depth, segmented, intrinsics)
+    seen = jax.jit(sample_rays)(jax.random.key(0), depth, segmented, intrinsics)
     return pooled(jax.tree.map(lambda x: x[None], seen), T)
 
 
@@ -235,7 +241,7 @@ def test_a_moved_and_turned_chair_is_found_there(chair, one_view, find):
     turned = turn_about_y(jnp.float32(np.pi / 2))
     T = jaxlie.SE3.from_rotation_and_translation(turned, jnp.array([3.0, 1.0, -2.0]))
     move = lambda points: camera.transform(T, points)  # noqa: E731
-    elsewhere = Sight(move(seen.surface), move(seen.free), turned @ seen.away)
+    elsewhere = RaySamples(move(seen.surface), move(seen.free), turned @ seen.away)
     moved = find(elsewhere, 1.0 - chair.extents[1] / 2)
     expected = (T @ found.T_world_object).as_matrix()
     np.testing.assert_allclose(moved.T_world_object.as_matrix(), expected, atol=0.02)
@@ -252,5 +258,5 @@ def test_an_earlier_placement_is_gone_on_from(chair, one_view, find):
 
 def test_nothing_seen_is_nothing_placed(find):
     nan = jnp.full((SURFACE_POINTS, 3), jnp.float32(jnp.nan))
-    nothing = Sight(nan, nan[:FREE_POINTS], nan[0])
+    nothing = RaySamples(nan, nan[:FREE_POINTS], nan[0])
     assert jnp.isinf(find(nothing).misfit)

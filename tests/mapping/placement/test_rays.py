@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxshape.geometry import camera
-from jaxshape.mapping.placement.rays import pooled, sight
+from jaxshape.mapping.placement.rays import pooled, sample_rays
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def frame():
 
 @pytest.fixture(scope="module")
 def seen(frame):
-    return jax.jit(sight)(jax.random.key(0), *frame)
+    return jax.jit(sample_rays)(jax.random.key(0), *frame)
 
 
 def depth_at(points, depth, intrinsics):
@@ -55,7 +55,7 @@ def test_free_points_lie_well_in_front_of_what_was_met(frame, seen):
 @pytest.fixture(scope="module")
 def nothing(frame):
     depth, segmented, intrinsics = frame
-    return jax.jit(sight)(jax.random.key(0), depth, jnp.zeros_like(segmented), intrinsics)
+    return jax.jit(sample_rays)(jax.random.key(0), depth, jnp.zeros_like(segmented), intrinsics)
 
 
 def test_a_frame_without_the_object_gives_nothing_finite(nothing):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.mapping.tracking import icp
 from jaxshape.mapping.tracking.icp import Cloud, Matches
-from jaxshape.mapping.tracking.views import View, view_of
+from jaxshape.mapping.tracking.views import DepthView, view_of
 
 SIGMA = 0.002
 """Standard deviation, in metres, claimed for all points here."""
@@ -158,7 +158,7 @@ def test_one_frame_finds_the_pose_of_another_and_the_reverse():
 
 
 @jax.jit
-def align_views(reference: View, moving: View):
+def align_views(reference: DepthView, moving: DepthView):
     match = icp.match_view(reference, jaxlie.SE3.identity())
     cloud = icp.cloud_of(moving, stride=2)
     start = jaxlie.SE3.identity()
