@@ -8,6 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
+from jaxshape.geometry.sensor import tolerance
 from jaxshape.mapping.segmentation.planes import (
     Floor,
     Plane,
@@ -17,7 +18,6 @@ from jaxshape.mapping.segmentation.planes import (
     height_above,
     nothing_below,
     on_plane,
-    tolerance,
 )  # fmt: skip
 
 WORKING_WIDTH = 320

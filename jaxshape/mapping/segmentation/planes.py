@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from jaxshape.geometry import camera
-from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.sensor import tolerance
 
 SAMPLE = 4000
 """Points among which planes are sought: enough for a plane that holds a fiftieth of them."""
@@ -54,18 +54,8 @@ def camera_points(
     depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "h w 3"]:
     """The camera-frame point of each pixel, in metres; NaN where no depth was measured."""
-    intrinsics = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
     measured = np.where((depth > 0) & np.isfinite(depth), depth, np.nan)
-    return np.asarray(camera.unproject(intrinsics, jnp.float32(measured)))
-
-
-def tolerance(z: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarray, "*n"]:
-    """How far, in metres, a point measured at depth `z` may lie from the plane that holds it.
-
-    Three standard deviations of a Kinect's noise and half a step of its depth, which grow with the
-    square of depth (see `jaxshape.data.render.SensorNoise`), and 5 mm for a floor that is not flat.
-    """
-    return 0.005 + 0.005 * z**2
+    return np.asarray(camera.unproject(camera.intrinsics_of(K), jnp.float32(measured)))
 
 
 def height_above(plane: Plane, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:

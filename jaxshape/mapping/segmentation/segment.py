@@ -16,7 +16,9 @@ from scipy.spatial import KDTree
 from skimage.color import rgb2lab
 from skimage.measure import label
 
+from jaxshape import checks
 from jaxshape.data.boxes import Box, points_in_box
+from jaxshape.geometry.sensor import tolerance
 from jaxshape.mapping.segmentation.clusters import (
     Pixel,
     Scene,
@@ -36,7 +38,6 @@ from jaxshape.mapping.segmentation.planes import (
     floor_plane,
     height_above,
     subsample,
-    tolerance,
 )
 
 SEPARABLE = 0.95
@@ -81,6 +82,18 @@ class Prompt:
     """`(left, top, right, bottom)`, in pixels, around the object."""
     depth_range: tuple[float, float] | None = None
     """Nearest and farthest depth of the object, in metres."""
+
+    def __post_init__(self) -> None:
+        for coordinate in self.click or ():
+            checks.at_least("click", coordinate, 0)
+        left, top, right, bottom = self.region or (0, 0, 1, 1)
+        if not (left < right and top < bottom):
+            wanted = "left, top, right, bottom in pixels, with left < right and top < bottom"
+            checks.refuse("region", self.region, wanted)
+        near, far = self.depth_range or (0, 1)
+        if not 0 <= near < far:
+            wanted = "the nearest, then the farthest depth, in metres"
+            checks.refuse("depth_range", self.depth_range, wanted)
 
 
 def segment(
@@ -164,13 +177,8 @@ def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:
         if not (max(left, 0) < min(right, w) and max(top, 0) < min(bottom, h)):
             raise ValueError(
                 f"The region {prompt.region} holds no pixel of the image of {w} x {h}; expected "
-                "left, top, right, bottom in pixels, with left < right and top < bottom."
+                "left, top, right, bottom in pixels."
             )
-    if prompt.depth_range is not None and not 0 <= prompt.depth_range[0] < prompt.depth_range[1]:
-        raise ValueError(
-            f"The depth range is {prompt.depth_range}; expected the nearest, then the farthest "
-            "depth, in metres."
-        )
 
 
 def _nothing(measured: Bool[np.ndarray, "h w"], reason: str) -> Segmentation:

@@ -19,7 +19,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.geometry import camera
-from jaxshape.mapping.tracking.views import DepthView, depth_deviation, is_oriented
+from jaxshape.geometry.sensor import depth_deviation
+from jaxshape.mapping.tracking.views import DepthView, is_oriented
 
 CUTOFF = 4.0
 """Standard deviations beyond which a residual has no weight (Tukey's function)."""
@@ -93,18 +94,14 @@ def match_view(view: DepthView, T_reference_camera: jaxlie.SE3) -> Match:
     A point in front of the view's surface, or where its rays met nothing, should have been seen;
     one behind that surface need not.
     """
-    h, w = view.depth.shape
     shown = jnp.concatenate([view.points, view.normals, view.depth[..., None]], axis=-1)
-    shown = shown.reshape(-1, 7)
     R, t = T_reference_camera.rotation().as_matrix(), T_reference_camera.translation()
 
     def match(points, normals, distance):
         p, n = (points - t) @ R, normals @ R
         pixels, depth = camera.project(view.intrinsics, p)
-        column, row = pixels[:, 0], pixels[:, 1]
-        inside = (depth > 0) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
-        index = row.astype(jnp.int32) * w + column.astype(jnp.int32)
-        found = shown.at[jnp.where(inside, index, h * w)].get(mode="fill", fill_value=0.0)
+        ahead = jnp.where(depth[:, None] > 0, pixels, -1.0)  # behind the camera is outside
+        found = camera.look_up(shown, ahead)
         q, q_normal, measured = found[:, :3], found[:, 3:6], found[:, 6]
         agrees = jnp.sum(q_normal * n, axis=-1) > AGREEING  # 0 where no normal is known
         near = jnp.sum((p - q) ** 2, axis=-1) < distance**2

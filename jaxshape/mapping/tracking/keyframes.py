@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.data.sequences import Frame
 from jaxshape.geometry import grid
-from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.camera import Intrinsics, intrinsics_of
 from jaxshape.geometry.grid import RESOLUTION, GridFrame
 from jaxshape.mapping.tracking import icp
 from jaxshape.mapping.tracking.icp import Cloud
@@ -145,11 +145,10 @@ def prepare(
     frame: Frame, K: Float[np.ndarray, "3 3"], masked: Bool[np.ndarray, "h w"] | None = None
 ) -> PreparedFrame:
     """A frame at working size, with its oriented points; `masked` in place of its own mask."""
-    intrinsics = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
     halvings = 0
     while frame.depth.shape[1] >> halvings > WORKING_WIDTH:
         halvings += 1
-    view = _view(jnp.asarray(frame.depth), intrinsics, halvings)
+    view = _view(jnp.asarray(frame.depth), intrinsics_of(K), halvings)
     mask = frame.mask if masked is None else masked
     if mask is None:
         return PreparedFrame(view, jnp.ones(view.depth.shape, bool))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.geometry.grid import RESOLUTION, flat_index
 from jaxshape.mapping.tracking.icp import AGREEING, Match, Matches
 
 CELLS = 2 * RESOLUTION
@@ -54,9 +54,7 @@ class Surface(NamedTuple):
 def cell_of(lattice: Lattice, points: Float[Array, "*n 3"]) -> Int[Array, "*n"]:
     """Index of the cell that holds each world point; `CELLS**3` outside the grid."""
     cell = points @ lattice.linear.T + lattice.offset
-    inside = jnp.all((cell >= 0) & (cell < CELLS), axis=-1)  # False for NaN
-    x, y, z = jnp.moveaxis(cell.astype(jnp.int32), -1, 0)
-    return jnp.where(inside, (x * CELLS + y) * CELLS + z, CELLS**3)
+    return flat_index(jnp.moveaxis(cell, -1, 0), CELLS)
 
 
 def cell_size(lattice: Lattice) -> Float[Array, ""]:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.sensor import depth_deviation
 
 JUMP = 0.03
 """Neighbouring pixels whose depths differ by more than this share of it lie on two surfaces."""
@@ -27,15 +28,6 @@ class DepthView(NamedTuple):
     normals: Float[Array, "h w 3"]
     """Of unit length and towards the camera; 0 where the image does not tell."""
     intrinsics: Intrinsics
-
-
-def depth_deviation(depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Standard deviation of a structured-light depth, in metres: noise and quantisation.
-
-    Grows with the square of depth (Khoshelham and Elberink, Sensors, 2012), and is never below half
-    a millimetre.
-    """
-    return jnp.maximum(1.6e-3 * depth**2, 5e-4)
 
 
 def view_of(depth: Float[Array, "h w"], intrinsics: Intrinsics) -> DepthView:

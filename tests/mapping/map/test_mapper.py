@@ -7,7 +7,7 @@ from analytic_room import CHAIR, CRATE, FLOOR, TABLE, WALLS, K, room
 
 from jaxshape.data.boxes import Box
 from jaxshape.geometry import fusion, grid
-from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.camera import intrinsics_of
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import build_mapper
 from jaxshape.mapping.map.state import fused_anew
@@ -17,7 +17,7 @@ from jaxshape.mapping.tracking.views import view_of
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
-LENS = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
+LENS = intrinsics_of(K)
 FURNITURE = (FLOOR, WALLS, CHAIR, TABLE, CRATE)
 T_WORLD_OBJECT = np.eye(4)
 T_WORLD_OBJECT[:3, 3] = 0, 0.49, 0

@@ -13,7 +13,6 @@ from jaxshape.mapping.segmentation.planes import (
     floor_plane,
     height_above,
     on_plane,
-    tolerance,
 )
 
 
@@ -121,9 +120,3 @@ def test_unmeasured_pixels_have_no_point():
     known = np.isfinite(points).all(axis=-1)
     np.testing.assert_array_equal(known, (depth > 0) & np.isfinite(depth))
     assert not on_plane(Plane(np.array([0.0, 0, -1]), 2.0, 1.0), points)[~known].any()
-
-
-def test_the_tolerance_holds_three_deviations_of_a_kinect():
-    z = np.linspace(0.5, 5, 10)
-    assert (tolerance(z) >= 3 * 1.4e-3 * z**2).all()
-    assert (np.diff(tolerance(z)) > 0).all()

@@ -6,13 +6,13 @@ import pytest
 from analytic_room import CHAIR, CRATE, FLOOR, TABLE, WALLS, K, room
 from scipy.spatial.transform import Rotation
 
-from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.camera import intrinsics_of
 from jaxshape.mapping.config import TrackingConfig
 from jaxshape.mapping.tracking import icp, registration
 from jaxshape.mapping.tracking.icp import Alignment
 from jaxshape.mapping.tracking.views import view_of
 
-LENS = Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
+LENS = intrinsics_of(K)
 CENTER = np.array([0.0, 0.45, 0.0])
 FURNITURE = (FLOOR, WALLS, CHAIR, TABLE, CRATE)
 
