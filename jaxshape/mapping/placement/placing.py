@@ -26,6 +26,7 @@ from jax import lax
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Int
 
+from jaxshape import checks
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
 from jaxshape.mapping.placement.rays import RaySamples
@@ -55,6 +56,20 @@ class PlacementConfig:
     """Of their improvement."""
     steps_again: int = 25
     """The same, where an earlier placement is known."""
+
+    def __post_init__(self) -> None:
+        for name in ("typical_size", "size_spread"):
+            for extent in getattr(self, name):
+                checks.positive(name, extent)
+        checks.whole("yaws", self.yaws, 1)
+        for overhang in self.overhangs:
+            checks.at_least("overhangs", overhang, 0)
+        for name in ("kept", "steps", "steps_again"):
+            checks.whole(name, getattr(self, name), 1)
+        proposed = 1 + self.yaws * len(self.overhangs)
+        if self.kept > proposed:
+            wanted = f"at most the {proposed} boxes that yaws and overhangs propose"
+            checks.refuse("kept", self.kept, wanted)
 
 
 COMPARED_POINTS = 2048
