@@ -7,12 +7,12 @@ from .geometry.evidence import Grids, binary
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
 from .mapping.config import MappingConfig, TrackingConfig
-from .mapping.finding import find_start
-from .mapping.incremental import Mapper, build_mapper
-from .mapping.keyframes import Shot
-from .mapping.placement import Placement, PlacementConfig, place
-from .mapping.recording import Progress, follow, trajectory
-from .mapping.segmentation import Prompt, Segmentation, segment
+from .mapping.map.mapper import Mapper, build_mapper
+from .mapping.map.recording import Progress, follow, trajectory
+from .mapping.placement.finding import find_start
+from .mapping.placement.placing import Placement, PlacementConfig, place
+from .mapping.segmentation.segment import Prompt, Segmentation, segment
+from .mapping.tracking.keyframes import PreparedFrame
 from .model.config import Architecture
 from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
 from .model.weights import load_prior, save_prior
@@ -67,6 +67,7 @@ __all__ = [
     "Placement",
     "PlacementConfig",
     "Prepared",
+    "PreparedFrame",
     "Progress",
     "Prompt",
     "Reconstruction",
@@ -78,7 +79,6 @@ __all__ = [
     "Segmentation",
     "ShapeModel",
     "ShapePrior",
-    "Shot",
     "StopReason",
     "Target",
     "Tolerances",

@@ -1,13 +1,17 @@
 """Options that several commands take, and the ranges in which they make sense."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
 from typing import Any
 
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+
 from jaxshape import process
+from jaxshape.checks import BadSetting
 from jaxshape.cli.common import require
-from jaxshape.data.config import Axis, DatasetConfig
-from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.data.config import Axis, check_axes
 from jaxshape.model.config import TrainConfig
 from jaxshape.search.config import RefineConfig
 
@@ -20,6 +24,9 @@ class Axes:
     """Axis of the meshes that points up."""
     front: Axis = "z"
     """Axis of the meshes along which the object's front looks."""
+
+    def __post_init__(self) -> None:
+        check_axes(self.up, self.front)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +59,55 @@ class Machines:
             process.join_processes(self.coordinator, count, index)
 
 
+class RefusedSetting(Exception):
+    """Settings refused what the parser gave them, in one sentence.
+
+    Not a `ValueError`, for the parser would make a page of its own of that.
+    """
+
+
+def reworded(problem: ValueError) -> str:
+    """The sentence of a refusal, with the option in place of the field."""
+    if not isinstance(problem, BadSetting):
+        return str(problem)
+    value = problem.value
+    given = " ".join(map(str, value)) if isinstance(value, tuple) else value
+    return f"--{problem.name.replace('_', '-')} is {given}; give {problem.wanted}."
+
+
+def refusing() -> ConstructorRegistry:
+    """Rules for the parser, by which the refusals of settings end in `RefusedSetting`."""
+    registry, asked = ConstructorRegistry(), []
+
+    @registry.struct_rule
+    def rule(info: StructTypeInfo) -> Any:
+        if asked or not hasattr(info.type, "__post_init__"):
+            return None
+        asked.append(info)  # so that the rules of the parser answer, not this one again
+        try:
+            spec = ConstructorRegistry.get_struct_spec(info)
+        finally:
+            asked.pop()
+        if not isinstance(spec, StructConstructorSpec):
+            return spec
+        return replace(spec, instantiate=_refusing(spec.instantiate))
+
+    return registry
+
+
+def _refusing(build: Callable[..., Any]) -> Callable[..., Any]:
+    """A constructor whose `ValueError` ends in `RefusedSetting`."""
+
+    @wraps(build)
+    def built(*values: Any, **fields: Any) -> Any:
+        try:
+            return build(*values, **fields)
+        except ValueError as problem:
+            raise RefusedSetting(reworded(problem)) from problem
+
+    return built
+
+
 def checked_search(search: RefineConfig) -> RefineConfig:
     """The options of a search, once each is in its range."""
     _require_each(
@@ -68,46 +124,9 @@ def checked_search(search: RefineConfig) -> RefineConfig:
     return search
 
 
-def checked_mapping(config: MappingConfig) -> MappingConfig:
-    """The options of a map, once each is in its range."""
-    _require_each(
-        config,
-        ("keyframe_angle", _positive(config.keyframe_angle), "a number of degrees above 0"),
-        ("keyframe_distance", _positive(config.keyframe_distance), "a number of metres above 0"),
-        ("min_hits", config.min_hits >= 1, "1 or more"),
-        ("keyframe_iterations", config.keyframe_iterations >= 1, "1 or more"),
-    )
-    return config
-
-
-def checked_tracking(config: TrackingConfig) -> TrackingConfig:
-    """The options of tracking, once each is in its range."""
-    _require_each(
-        config,
-        ("min_inliers", 0 <= config.min_inliers <= 1, "a share from 0 to 1"),
-        ("sure_inliers", 0 <= config.sure_inliers <= 1, "a share from 0 to 1"),
-        ("min_overlap", 0 <= config.min_overlap <= 1, "a share from 0 to 1"),
-        ("max_angle", _positive(config.max_angle), "a number of degrees above 0"),
-        ("max_distance", _positive(config.max_distance), "a number of metres above 0"),
-    )
-    return config
-
-
-def checked_dataset(config: DatasetConfig) -> DatasetConfig:
-    """The options of a dataset, once each is in its range."""
-    _require_each(
-        config,
-        ("views", config.views >= 1, "1 or more"),
-        ("noisy", 0 <= config.noisy <= 1, "a share from 0 to 1"),
-        ("seed", config.seed >= 0, "a number that is not negative"),
-    )
-    return config
-
-
 def checked_training(config: TrainConfig) -> TrainConfig:
     """The options of a training run, once each is in its range."""
-    sizes, inputs = config.architecture, config.inputs
-    shares = ("complete", "pose_error", "missing", "segmentation")
+    sizes = config.architecture
     _require_each(
         config,
         ("steps", config.steps >= 1, "1 or more"),
@@ -124,12 +143,6 @@ def checked_training(config: TrainConfig) -> TrainConfig:
         ("encoder", min(sizes.encoder) >= 1, "four numbers of channels from 1 up"),
         ("decoder", min(sizes.decoder) >= 1, "three numbers of channels from 1 up"),
         ("code", sizes.code >= 2, "2 or more"),
-    )
-    _require_each(
-        inputs,
-        ("max_views", inputs.max_views >= 1, "1 or more"),
-        ("scale", 0 <= inputs.scale < 1, "a share from 0 to below 1"),
-        *((name, 0 <= getattr(inputs, name) <= 1, "a share from 0 to 1") for name in shares),
     )
     return config
 

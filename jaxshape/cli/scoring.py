@@ -51,7 +51,6 @@ class Evaluate:
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
         from jaxshape.data.dataset import TEST_SEEDS
-        from jaxshape.data.meshes import axes_to_canonical
         from jaxshape.model.weights import load_prior
         from jaxshape.results import evaluation
 
@@ -63,7 +62,6 @@ class Evaluate:
             refine=checked_search(self.search),
             seed=self.seed,
         )
-        axes_to_canonical(self.axes.up, self.axes.front)
         require(
             (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
             "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",
