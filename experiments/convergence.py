@@ -25,11 +25,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.report.figures import LINES, PAGE, PINK, RED, draw_mean, save_column, tidy
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import LINES, PAGE, PINK, RED, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import reconstruct, refiner_for
+from study import (
     TUNED,
     Claim,
     Contestant,
@@ -42,8 +44,6 @@ from jaxshape.results.study import (
     mean_interval,
     mean_low_high,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.reconstruction import reconstruct, refiner_for
 
 RESULTS = Path(__file__).parent / "results"
 CHAIRS_AT_A_TIME = 8

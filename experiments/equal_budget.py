@@ -28,7 +28,7 @@ from scipy.stats import spearmanr
 
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.results.figures import (
+from jaxshape.report.figures import (
     BLUE,
     GREY,
     INK,
@@ -43,7 +43,12 @@ from jaxshape.results.figures import (
 )
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.methods.hybrid import POLISH, polished
+from jaxshape.search.reconstruction import reconstruct
+from jaxshape.search.refiner import Refiner, StopReason
+from study import (
     TUNED,
     Claim,
     Contestant,
@@ -54,11 +59,6 @@ from jaxshape.results.study import (
     groups,
     mean_interval,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods import build_refiner
-from jaxshape.search.methods.hybrid import POLISH, polished
-from jaxshape.search.reconstruction import reconstruct
-from jaxshape.search.refiner import Refiner, StopReason
 
 RESULTS = Path(__file__).parent / "results"
 

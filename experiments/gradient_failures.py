@@ -36,12 +36,15 @@ from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.report.figures import PAGE, save_column
+from jaxshape.report.pictures import grid_panel, measurement_panel
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
-from jaxshape.results.figures import PAGE, save_column
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import grid_panel, measurement_panel
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.objective import cross_entropy, target
+from jaxshape.search.reconstruction import reconstruct, refiner_for
+from study import (
     TUNED,
     Claim,
     Subject,
@@ -51,9 +54,6 @@ from jaxshape.results.study import (
     subjects,
     tuned,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.objective import cross_entropy, target
-from jaxshape.search.reconstruction import reconstruct, refiner_for
 
 RESULTS = Path(__file__).parent / "results"
 SHAPES = ("encoder", *TUNED)

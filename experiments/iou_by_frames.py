@@ -20,9 +20,9 @@ import numpy as np
 import tyro
 
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
+from jaxshape.report.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
-from jaxshape.results.study import (
+from study import (
     Claim,
     TestSet,
     column,

@@ -29,9 +29,9 @@ from jaxshape.data import meshes
 from jaxshape.data.split import hold_out
 from jaxshape.files import atomic_path
 from jaxshape.model.weights import ShapePrior, load_prior
+from jaxshape.report.pictures import COLORS, Panel, render_mesh, render_voxels
 from jaxshape.results.evaluation import Case, EvaluateConfig, observe
 from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import COLORS, Panel, render_mesh, render_voxels
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
 

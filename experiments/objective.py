@@ -27,11 +27,16 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.report.figures import BLUE, GREY, INK, ORANGE, PAGE, interval, save_column, tidy
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import BLUE, GREY, INK, ORANGE, PAGE, interval, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.objective import Weights, target
+from jaxshape.search.reconstruction import compose, search_space, unlikeliness
+from jaxshape.search.run import refine
+from study import (
     Claim,
     Contestant,
     TestSet,
@@ -43,11 +48,6 @@ from jaxshape.results.study import (
     mean_interval,
     mean_low_high,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods import build_refiner
-from jaxshape.search.objective import Weights, target
-from jaxshape.search.reconstruction import compose, search_space, unlikeliness
-from jaxshape.search.run import refine
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -35,14 +35,14 @@ from jaxshape.mapping.recording import Progress, follow
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.mapping.state import State, grids_of
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.results.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
+from jaxshape.report.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
+from jaxshape.report.pictures import render_measurement, render_voxels
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
-from jaxshape.results.pictures import render_measurement, render_voxels
-from jaxshape.results.study import Claim, conclude
 from jaxshape.results.surface import surface
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, refiner_for
+from study import Claim, conclude
 
 RESULTS = Path(__file__).parent / "results"
 WAYS = {"given": "poses given", "first": "first pose given, others tracked"}

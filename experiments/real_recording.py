@@ -40,8 +40,8 @@ from jaxshape.mapping.segmentation import Prompt
 from jaxshape.mapping.tracking import displacement
 from jaxshape.model.weights import ShapePrior, load_prior
 from jaxshape.process import prepare_process
+from jaxshape.report.pictures import Panel, grid_panel, overview, render_mesh
 from jaxshape.results.output import SMOOTHING
-from jaxshape.results.pictures import Panel, grid_panel, overview, render_mesh
 from jaxshape.results.surface import surface
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for

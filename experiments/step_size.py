@@ -26,8 +26,7 @@ from jaxtyping import Array
 
 from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import (
+from jaxshape.report.figures import (
     BLUE,
     GREEN,
     GREY,
@@ -38,9 +37,14 @@ from jaxshape.results.figures import (
     save_column,
     tidy,
 )
+from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
+from jaxshape.search.reconstruction import reconstruct, refiner_for
+from jaxshape.search.refiner import Refiner
+from study import (
     Claim,
     Contestant,
     Scores,
@@ -49,10 +53,6 @@ from jaxshape.results.study import (
     conclude,
     mean_interval,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
-from jaxshape.search.reconstruction import reconstruct, refiner_for
-from jaxshape.search.refiner import Refiner
 
 RESULTS = Path(__file__).parent / "results"
 CASES_AT_A_TIME = 15

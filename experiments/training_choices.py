@@ -51,9 +51,9 @@ from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.config import Architecture, TrainConfig
 from jaxshape.model.training import finished_prior, train
 from jaxshape.model.weights import ShapePrior
+from jaxshape.report.pictures import COLORS
 from jaxshape.results.evaluation import EvaluateConfig, evaluate, summarize
 from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import COLORS
 from jaxshape.search.config import RefineConfig
 
 RESULTS = Path(__file__).parent / "results"

@@ -15,8 +15,8 @@ from .mapping.segmentation import Prompt, Segmentation, segment
 from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
 from .model.config import Architecture
 from .model.weights import ShapePrior, load_prior, save_prior
+from .report.page import write_report
 from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
-from .results.report import write_report
 from .results.surface import surface, write_mesh
 from .search.cma import cma
 from .search.config import RefineConfig

@@ -171,7 +171,7 @@ class Train:
         """Write the weights and cards of a finished run, and score it on what was held out."""
         from jaxshape.model.training import finished_prior, read_metrics
         from jaxshape.model.weights import load_prior, save_prior
-        from jaxshape.results.card import describe, training_card
+        from jaxshape.report.card import describe, training_card
         from jaxshape.results.evaluation import EvaluateConfig
 
         card = training_card(

@@ -85,8 +85,8 @@ class Demo(Rebuild):
         from jaxshape.data.chairs import random_chair
         from jaxshape.data.dataset import TEST_SEEDS
         from jaxshape.geometry import camera, fusion
+        from jaxshape.report.page import write_report
         from jaxshape.results.output import Observation, write_result
-        from jaxshape.results.report import write_report
         from jaxshape.search.reconstruction import reconstruct_jit, require_measured
 
         require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")

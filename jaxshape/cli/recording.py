@@ -176,9 +176,9 @@ class Reconstruct(Rebuild):
 
     def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
         """Draw what was found and say it."""
+        from jaxshape.report.page import write_report
         from jaxshape.results.output import draw
         from jaxshape.results.progress import observation_of
-        from jaxshape.results.report import write_report
 
         observation = observation_of(progress.state, self.mapping.min_hits)
         with console.status("drawing"):

@@ -166,7 +166,7 @@ def score(
 
 
 def _print_table(means: dict[str, Any], count: int) -> None:
-    from jaxshape.results.card import COLUMNS, rows_of
+    from jaxshape.report.card import COLUMNS, rows_of
 
     table = Table(title=f"means over {count} meshes", title_justify="left")
     for column in COLUMNS:
@@ -191,7 +191,7 @@ class Plot:
     """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder where not given."""
 
     def run(self) -> None:
-        from jaxshape.results.plots import compare_searches, plot_search
+        from jaxshape.report.plots import compare_searches, plot_search
         from jaxshape.results.traces import read_search
 
         require(bool(self.results), "Give one result folder or more.")

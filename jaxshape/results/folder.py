@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, UInt8
 
-from jaxshape.results.pictures import COLORS
+from jaxshape.report.pictures import COLORS
 
 
 class Layer(NamedTuple):

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.report.pictures import grid_panel, measurement_panel, mesh_panel, overview
 from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import grid_panel, measurement_panel, mesh_panel, overview
 from jaxshape.results.surface import surface, write_mesh
 from jaxshape.results.traces import write_trace
 from jaxshape.search.reconstruction import Reconstruction

@@ -26,8 +26,8 @@ from result_folder import (
     write_json,
 )
 
-from jaxshape.results import illustrations, plots
-from jaxshape.results.report import write_report
+from jaxshape.report import illustrations, plots
+from jaxshape.report.page import write_report
 
 FILES = ("mesh.glb", "grid.npz", "trace.npz", "keyframes.json", "result.json")
 

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from jaxshape.results.pictures import (
+from jaxshape.report.pictures import (
     COLORS,
     depth_panels,
     draw_voxels,
@@ -223,5 +223,5 @@ def test_draw_voxels_shows_the_picture_alone():
 
 
 def test_importing_the_module_leaves_matplotlib_alone():
-    code = "import sys, jaxshape.results.pictures; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, jaxshape.report.pictures; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

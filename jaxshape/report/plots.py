@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxshape.results.figures import BLUE, CYCLE, GREEN, INK, ORANGE, save_figure, tidy
+from jaxshape.report.figures import BLUE, CYCLE, GREEN, INK, ORANGE, save_figure, tidy
 from jaxshape.results.traces import Search, restarts
 from jaxshape.search.refiner import Distribution, Trace
 

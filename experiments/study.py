@@ -20,8 +20,8 @@ from jaxshape.data.archives import list_meshes
 from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
 from jaxshape.data.meshes import Skipped
 from jaxshape.model.weights import ShapePrior
+from jaxshape.report.figures import interval
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
-from jaxshape.results.figures import interval
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds, iou
 from jaxshape.search.config import RefineConfig

@@ -13,7 +13,7 @@ import trimesh
 from jaxtyping import Bool, Float, Integer, UInt8
 
 from jaxshape.files import atomic_path
-from jaxshape.results.figures import BLUE, GREEN, INK, ORANGE
+from jaxshape.report.figures import BLUE, GREEN, INK, ORANGE
 
 AZIMUTH, ELEVATION = 35.0, 25.0
 

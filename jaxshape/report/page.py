@@ -1,6 +1,6 @@
 """`report.html`: a whole result on one page that needs no network and no other file. [host]
 
-The page turns the shape with some 300 lines of WebGL of its own (report.js, 11 kB). The three.js in
+The page turns the shape with some 300 lines of WebGL of its own (page.js, 11 kB). The three.js in
 trimesh's notebook viewer is 700 kB of minified script from 2022, and has no layers to switch.
 """
 
@@ -16,9 +16,9 @@ from string import Template
 from typing import Any
 
 from jaxshape.files import atomic_path
-from jaxshape.results import illustrations
+from jaxshape.report import illustrations
+from jaxshape.report.illustrations import Picture
 from jaxshape.results.folder import LAYERS, Keyframe, ResultFolder, read_folder
-from jaxshape.results.illustrations import Picture
 from jaxshape.results.summary import headline, number, tracked, warnings_of
 
 KEYFRAMES_TO_SHOW = 12
@@ -40,7 +40,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     warnings. All text that comes from the folder is escaped. `ValueError` for no folder.
     """
     found = read_folder(folder)
-    script = _beside("report.js")
+    script = _beside("page.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     scene = illustrations.scene(found)
     sections = [
@@ -52,7 +52,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
         _frames(found),
         _all_figures(found),
     ]
-    page = Template(_beside("report.html")).substitute(
+    page = Template(_beside("page.html")).substitute(
         title=escape(str(found.result.get("object", found.name))),
         subtitle=escape(_subtitle(found)),
         running=" · still running" if found.result.get("running") else "",

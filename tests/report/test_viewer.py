@@ -15,8 +15,8 @@ from result_folder import KEYFRAMES, change_json, write_folder, write_json
 from jaxshape.cli import common, viewing
 
 pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
-from jaxshape.results import viewer
-from jaxshape.results.viewer import LiveView, view
+from jaxshape.report import viewer
+from jaxshape.report.viewer import LiveView, view
 
 GRIDS = {"/occupied", "/occluded", "/encoder", "/refined", "/composed", "/truth"}
 

@@ -10,6 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxshape.report.pictures import (
+    Panel,
+    depth_panels,
+    grid_panel,
+    measurement_panel,
+    render_mesh,
+)
 from jaxshape.results.folder import (
     LAYERS,
     Keyframe,
@@ -20,13 +27,6 @@ from jaxshape.results.folder import (
     mesh_in_object,
     picture,
     thumbnail,
-)
-from jaxshape.results.pictures import (
-    Panel,
-    depth_panels,
-    grid_panel,
-    measurement_panel,
-    render_mesh,
 )
 
 _WIDTH = 320  # pixels of a keyframe's pictures
@@ -45,7 +45,7 @@ class Picture(NamedTuple):
 
 
 def scene(found: ResultFolder) -> dict[str, Any]:
-    """What report.js draws: layers in the object frame, and where to look.
+    """What page.js draws: layers in the object frame, and where to look.
 
     Numbers travel as base64 of their little-endian bytes; grids as bits, 4 KiB each, of which the
     page makes cubes itself.
@@ -191,7 +191,7 @@ def _outlined(image: UInt8[np.ndarray, "h w 3"], mask: Any) -> UInt8[np.ndarray,
 
 def convergence(folder: Path) -> Picture | None:
     """The course of the last search, drawn by `plot_search`; `None` where none was kept."""
-    from jaxshape.results.plots import plot_search
+    from jaxshape.report.plots import plot_search
     from jaxshape.results.traces import read_search
 
     try:

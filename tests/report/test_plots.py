@@ -8,8 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxshape.results import plots
-from jaxshape.results.plots import compare_searches, convergence, plot_search
+from jaxshape.report import plots
+from jaxshape.report.plots import compare_searches, convergence, plot_search
 from jaxshape.results.traces import Search
 from jaxshape.search.refiner import Distribution, Trace
 
@@ -132,5 +132,5 @@ def test_convergence_takes_traces_of_different_lengths(tmp_path):
 
 
 def test_importing_the_module_leaves_matplotlib_alone():
-    code = "import sys, jaxshape.results.plots; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, jaxshape.report.plots; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
