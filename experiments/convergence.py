@@ -23,12 +23,14 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float, Int
 
+from figures import LINES, PAGE, draw_mean, save_column
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.report.figures import LINES, PAGE, PINK, RED, draw_mean, save_column, tidy
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import PINK, RED
 from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 from study import (

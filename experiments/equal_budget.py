@@ -26,23 +26,13 @@ import tyro
 from jaxtyping import Array, Float, Int
 from scipy.stats import spearmanr
 
+from figures import LINES, PAGE, interval, save_column
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.report.figures import (
-    BLUE,
-    GREY,
-    INK,
-    LINES,
-    PAGE,
-    PINK,
-    RED,
-    SKY,
-    interval,
-    save_column,
-    tidy,
-)
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import BLUE, GREY, INK, PINK, RED, SKY
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.methods.hybrid import POLISH, polished

@@ -32,15 +32,15 @@ import tyro
 from jaxtyping import Array, Float
 from rich.progress import track
 
+from figures import PAGE, save_column
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import decode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.report.figures import PAGE, save_column
-from jaxshape.report.pictures import grid_panel, measurement_panel
+from jaxshape.report.panels import grid_panel, measurement_panel
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.objective import cross_entropy, target
 from jaxshape.search.reconstruction import reconstruct, refiner_for

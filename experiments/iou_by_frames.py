@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import tyro
 
+from figures import LINES, PAGE, draw_mean, save_column
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.report.figures import LINES, PAGE, draw_mean, save_column, tidy
+from jaxshape.report.figures import tidy
 from jaxshape.results.journal import Journal
 from study import (
     Claim,

@@ -25,12 +25,14 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Bool, Float
 
+from figures import PAGE, interval, save_column
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.report.figures import BLUE, GREY, INK, ORANGE, PAGE, interval, save_column, tidy
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import BLUE, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Weights, target

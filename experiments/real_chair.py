@@ -24,6 +24,7 @@ import numpy as np
 import trimesh
 import tyro
 
+from figures import save_column
 from jaxshape.data.boxes import Box, read_box
 from jaxshape.data.sequences import Sequence as Recording
 from jaxshape.data.sequences import open_sequence
@@ -35,7 +36,7 @@ from jaxshape.mapping.recording import Progress, follow
 from jaxshape.mapping.segmentation import Prompt
 from jaxshape.mapping.state import State, grids_of
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.report.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
+from jaxshape.report.palette import BLUE, INK, ORANGE, PINK, SKY
 from jaxshape.report.pictures import render_measurement, render_voxels
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING

@@ -24,22 +24,14 @@ import optax
 import tyro
 from jaxtyping import Array
 
+from figures import PAGE, draw_mean, save_column
 from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
-from jaxshape.report.figures import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PAGE,
-    draw_mean,
-    save_column,
-    tidy,
-)
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
 from jaxshape.search.reconstruction import reconstruct, refiner_for

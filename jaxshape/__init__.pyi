@@ -5,6 +5,7 @@ from .data.sequences import Trajectory, open_sequence, read_trajectory, write_tr
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
+from .geometry.overlap import iou
 from .mapping.config import MappingConfig, TrackingConfig
 from .mapping.finding import find_start
 from .mapping.incremental import Mapper, build_mapper
@@ -16,7 +17,7 @@ from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prep
 from .model.config import Architecture
 from .model.weights import ShapePrior, load_prior, save_prior
 from .report.page import write_report
-from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
+from .results.metrics import bounds, chamfer_l1, f_score, shape_scores
 from .results.surface import surface, write_mesh
 from .search.cma import cma
 from .search.config import RefineConfig

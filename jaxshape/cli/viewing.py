@@ -10,7 +10,7 @@ from jaxshape.cli.common import require
 
 
 @dataclass(frozen=True)
-class View:
+class ViewResult:
     """Show a result folder in the browser: the shape, grids and cameras, to turn and to switch on
     and off. While `jaxshape reconstruct` writes the folder, the picture follows.
 

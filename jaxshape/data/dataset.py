@@ -29,7 +29,7 @@ from jaxshape.data.capture import Capture, camera_distance, capture, measure_fra
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.config import DatasetConfig
 from jaxshape.data.meshes import Model, Skipped
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import camera, fusion
 from jaxshape.geometry.grid import RESOLUTION
 
@@ -46,7 +46,7 @@ class DatasetError(ValueError):
     """A dataset folder cannot be read or continued."""
 
 
-class Progress(NamedTuple):
+class DatasetProgress(NamedTuple):
     """How much of a build is done."""
 
     objects: int
@@ -114,7 +114,7 @@ def build_dataset(
     config: DatasetConfig = DatasetConfig(),
     *,
     workers: int | None = None,
-) -> Iterator[Progress]:
+) -> Iterator[DatasetProgress]:
     """Write the shards that are missing, in parallel processes, yielding progress after each.
 
     Raises `DatasetError` when the folder holds a dataset of other objects or settings.
@@ -126,7 +126,7 @@ def build_dataset(
     missing = [shard for shard in shards if not _shard_path(folder, shard[0], "json").exists()]
     done = sum(len(items) for _, items in shards) - sum(len(items) for _, items in missing)
     skipped = [s for n, _ in shards if (n, _) not in missing for s in _read_names(folder, n)[1]]
-    yield Progress(done, len(objects), skipped)
+    yield DatasetProgress(done, len(objects), skipped)
     if not missing:
         return
     write = partial(_write_shard, folder, config)
@@ -136,7 +136,7 @@ def build_dataset(
         for future in as_completed(futures):
             skipped = skipped + future.result()
             done += len(futures[future][1])
-            yield Progress(done, len(objects), skipped)
+            yield DatasetProgress(done, len(objects), skipped)
 
 
 def _write_shard(
@@ -155,8 +155,7 @@ def _write_shard(
     with atomic_path(_shard_path(folder, number, "npy")) as path:
         np.save(path, np.stack(grids) if grids else np.zeros(shape, np.uint8))
     # The names come last: a shard counts as written once they are there.
-    with atomic_path(_shard_path(folder, number, "json")) as path:
-        path.write_text(json.dumps({"names": names, "skipped": skipped}, indent=1))
+    write_json(_shard_path(folder, number, "json"), {"names": names, "skipped": skipped})
     return skipped
 
 
@@ -177,8 +176,7 @@ def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> No
                 "give another folder, or remove this one."
             )
         return
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(claim, indent=1))
+    write_json(path, claim)
 
 
 def _shard_path(folder: Path, number: int, suffix: str) -> Path:

@@ -10,16 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxshape.report.pictures import (
-    Panel,
-    depth_panels,
-    grid_panel,
-    measurement_panel,
-    render_mesh,
-)
+from jaxshape.report.palette import LAYERS
+from jaxshape.report.panels import Panel, depth_panels, grid_panel, measurement_panel
+from jaxshape.report.pictures import render_mesh
 from jaxshape.results.folder import (
-    LAYERS,
-    Keyframe,
+    KeyframeRecord,
     ResultFolder,
     camera_poses,
     extent,
@@ -149,7 +144,7 @@ def _grid_panel(title: str, name: str, have: dict[str, Any], note: str) -> Panel
     return grid_panel(title, have[name], "predicted", note=note)
 
 
-def keyframes(chosen: Sequence[Keyframe]) -> list[list[Picture]]:
+def keyframes(chosen: Sequence[KeyframeRecord]) -> list[list[Picture]]:
     """Colour with the object's outline, and depth, of each keyframe; what is there of them."""
     depths = [_depth(keyframe) for keyframe in chosen]
     panels = iter(depth_panels([depth for depth in depths if depth is not None]))
@@ -166,7 +161,7 @@ def keyframes(chosen: Sequence[Keyframe]) -> list[list[Picture]]:
     return pictured
 
 
-def _depth(keyframe: Keyframe) -> Float[np.ndarray, "h w"] | None:
+def _depth(keyframe: KeyframeRecord) -> Float[np.ndarray, "h w"] | None:
     stored = picture(keyframe, "depth")
     return None if stored is None else thumbnail(stored, _WIDTH).astype(np.float32) / 1000
 

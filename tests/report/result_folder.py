@@ -3,28 +3,41 @@
 import json
 
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
-import pytest
+from made_result import T_WORLD_OBJECT, observation, reconstruction, solid
 from PIL import Image
 
+from jaxshape.data.boxes import Box
+from jaxshape.data.sequences import Sequence
+from jaxshape.data.sequences.frames import FrameFiles
+from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import GridFrame
-from jaxshape.results import output
-from jaxshape.results.output import Observation, write_result
-from jaxshape.search.reconstruction import Reconstruction, compose
-from jaxshape.search.refiner import StopReason, Trace
+from jaxshape.mapping.finding import Start
+from jaxshape.mapping.keyframes import Keyframe, Place
+from jaxshape.mapping.recording import FrameLog, Progress
+from jaxshape.mapping.state import State
+from jaxshape.results.output import write_result
+from jaxshape.results.progress import write_progress
 
-T_WORLD_OBJECT = np.array([[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]], float)
 T_OBJECT_CAMERA = np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2], [0, 0, 0, 1]], float)
 """In front of the object, upright, looking at it."""
 
 KEYFRAMES = 3
 STATUSES = ("keyframe", "tracked", "keyframe", "lost", "unreadable", "tracked", "keyframe")
-
-
-def solid(lower, upper):
-    grid = np.zeros((32, 32, 32), bool)
-    grid[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))] = True
-    return grid
+SHAPE, INTRINSICS = (48, 64), (50.0, 50.0, 32.0, 24.0)
+ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]]
+INSIDE = (abs(ROW - 24) < 12) & (abs(COLUMN - 32) < 12)
+FIGURES = {
+    "seconds_track": 0.11,
+    "seconds_fuse": 0.22,
+    "seconds_refine": 1.33,
+    "inlier_fraction": 0.87,
+    "overlap": 0.64,
+    "rmse": 0.0042,
+    "conditioning": 0.0315,
+}
 
 
 def chair(seat: int, back: int):
@@ -36,50 +49,17 @@ def chair(seat: int, back: int):
 
 TRUTH, COMPLETED, FIRST = chair(3, 3), chair(3, 4), chair(5, 6)
 OCCUPIED, OCCLUDED = TRUTH & solid((0, 0, 12), (32, 32, 32)), solid((4, 1, 4), (28, 12, 12))
-OBSERVATION = Observation(
-    depth=[np.full((20, 30), 1.5, np.float32)],
-    occupied=OCCUPIED,
-    occluded=OCCLUDED,
-    frame=GridFrame(jnp.array([-0.32, -0.48, -0.32]), jnp.array([0.02, 0.03, 0.02])),
-    T_world_object=T_WORLD_OBJECT,
-    truth=TRUTH,
-)
-RECONSTRUCTION = Reconstruction(
-    first_code=jnp.zeros((1, 10)),
-    code=jnp.arange(10.0)[None],
-    completed_first=jnp.asarray(FIRST)[None],
-    logits=jnp.where(COMPLETED, 1.0, -1.0)[None],
-    completed=jnp.asarray(COMPLETED)[None],
-    composed=compose(jnp.asarray(OCCUPIED), jnp.asarray(OCCLUDED), jnp.asarray(COMPLETED))[None],
-    first_objective=jnp.array([0.5]),
-    objective=jnp.array([0.25]),
-    trace=Trace(*(jnp.array([[5.0, 4, 3]]),) * 3, jnp.array([[11, 21, 31]])),
-    path=jnp.zeros((1, 3, 10)),
-    iterations=jnp.array([3]),
-    stop=jnp.array([StopReason.TOLX]),
-)
+FRAME = GridFrame(jnp.array([-0.32, -0.48, -0.32]), jnp.array([0.02, 0.03, 0.02]))
+OBSERVATION = observation(OCCUPIED, OCCLUDED, TRUTH, FRAME)
+RECONSTRUCTION = reconstruction(OBSERVATION, FIRST, COMPLETED, steps=3)
 
 
 def write_folder(folder):
-    """What `demo` leaves, but for the picture, and keyframes beside it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(output, "overview", lambda *args, **settings: None)
-        write_result(folder, OBSERVATION, RECONSTRUCTION, {"object": "a chair", "seconds": 12.34})
-    (folder / "keyframes").mkdir()
-    poses = [pose(i) for i in range(len(STATUSES))]
-    frames = [
-        {
-            "index": i,
-            "name": f"frame-{i}",
-            "status": status,
-            "reason": "only 12 % agree" if status == "lost" else "",
-            "T_world_camera": None if status in ("lost", "unreadable") else poses[i].tolist(),
-        }
-        for i, status in enumerate(STATUSES)
-    ]
-    keyframes = [_keyframe(folder, i, poses[i]) for i, s in enumerate(STATUSES) if s == "keyframe"]
-    about = {"intrinsics": [50, 50, 32, 24], "shape": [48, 64]}
-    write_json(folder / "keyframes.json", about | {"keyframes": keyframes, "frames": frames})
+    """What `reconstruct` leaves, and `demo`, which knows the truth; without the overview."""
+    figures = {"object": "a chair", "seconds": 12.34, "search": {"objective": "balanced"}}
+    sequence = _recording(folder.parent / "recording")
+    write_progress(folder, sequence, _progress(), figures, 1, running=False)
+    write_result(folder, OBSERVATION, RECONSTRUCTION, figures)
 
 
 def pose(index):
@@ -89,29 +69,64 @@ def pose(index):
     return T_WORLD_OBJECT @ aside @ T_OBJECT_CAMERA
 
 
-def _keyframe(folder, index, T_world_camera):
-    name = f"frame-{index}"
-    row, column = np.mgrid[:48, :64]
-    inside = (abs(row - 24) < 12) & (abs(column - 32) < 12)
-    color = np.where(inside[..., None], (180, 90, 40), (200, 210, 220)).astype(np.uint8)
-    depth = np.where(inside, 1900, 2500).astype(np.uint16)
-    files = {k: f"keyframes/{name}{end}" for k, end in
-             {"image": ".jpg", "depth": ".depth.png", "mask": ".mask.png"}.items()}  # fmt: skip
-    Image.fromarray(color).save(folder / files["image"])
-    Image.fromarray(depth).save(folder / files["depth"])
-    Image.fromarray(inside.astype(np.uint8) * 255).save(folder / files["mask"])
-    return {
-        "index": index,
-        "name": name,
-        "T_world_camera": T_world_camera.tolist(),
-        **files,
-        "inlier_fraction": 0.87,
-        "rmse": 0.0042,
-        "conditioning": 31.5,
-        "seconds": {"track": 0.11, "fuse": 0.22, "refine": 1.33},
-        "objective": 0.4567,
-        "iou": 0.789,
-    }
+def _recording(folder):
+    """Its colour images, which are all that is read of it."""
+    folder.mkdir(parents=True)
+    color = np.where(INSIDE[..., None], (180, 90, 40), (200, 210, 220)).astype(np.uint8)
+    files = [FrameFiles(f"frame-{i}", folder / f"{i}.depth.png", folder / f"{i}.color.png", None)
+             for i in range(len(STATUSES))]  # fmt: skip
+    for one in files:
+        Image.fromarray(color).save(one.color)
+        Image.fromarray(np.where(INSIDE, 1900, 2500).astype(np.uint16)).save(one.depth)
+    return Sequence(
+        layout="7-scenes",
+        intrinsics=np.diag([50.0, 50.0, 1.0]),
+        camera="given",
+        files=tuple(files),
+        read_pose=lambda index: None,
+        has_poses=False,
+        shape=SHAPE,
+        depth_scale=1000.0,
+    )
+
+
+def _progress():
+    """A map of the keyframes with what is written of it, and nothing else."""
+    last, logs, keyframes = 0, [], []
+    for i, status in enumerate(STATUSES):
+        if status == "keyframe":
+            last = i
+            keyframes.append(_keyframe(pose(i)))
+        there = status in ("keyframe", "tracked")
+        reason = "only 12 % agree" if status == "lost" else ""
+        relative = np.linalg.inv(pose(last)) @ pose(i) if there else None
+        figures = FIGURES if there else {}
+        number = len(keyframes) - 1
+        logs.append(FrameLog(i, f"frame-{i}", status, reason, number, relative, figures))
+    box = Box(T_WORLD_OBJECT, np.ones(3), np.zeros((0, 2, 3)))
+    state = only(
+        State,
+        keyframes=tuple(keyframes),
+        place=only(Place, box=box, frame=FRAME),
+        measurement=Measurement(jnp.int32(OCCUPIED), jnp.asarray(~(OCCUPIED | OCCLUDED))),
+    )
+    start = only(Start, box=box, notes=(), warnings=())
+    return Progress(state, start, tuple(logs), RECONSTRUCTION)
+
+
+def _keyframe(T_world_camera):
+    return only(
+        Keyframe,
+        depth=jnp.where(INSIDE, 1.9, 2.5),
+        segmented=jnp.asarray(INSIDE),
+        intrinsics=Intrinsics(*jnp.float32(INTRINSICS)),
+        T_world_camera=jaxlie.SE3.from_matrix(jnp.float32(T_world_camera)),
+    )
+
+
+def only(kind, **fields):
+    """A named tuple of which some fields are known."""
+    return kind(**dict.fromkeys(kind._fields) | fields)
 
 
 def write_json(path, content):

@@ -6,10 +6,9 @@ import sys
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from PIL import Image
 
 from jaxshape.report import plots
-from jaxshape.report.plots import compare_searches, convergence, plot_search
+from jaxshape.report.plots import compare_searches, plot_search
 from jaxshape.results.traces import Search
 from jaxshape.search.refiner import Distribution, Trace
 
@@ -120,15 +119,6 @@ def test_the_same_search_gives_the_same_picture(tmp_path):
         plot_search(tmp_path / name, make_search())
     first, second = (path.read_bytes() for path in sorted(tmp_path.iterdir()))
     assert first == second
-
-
-def test_convergence_takes_traces_of_different_lengths(tmp_path):
-    falling = np.linspace(1, 0, 20) + np.zeros((5, 1))
-    convergence(tmp_path / "plot.png", {"CMA-ES": falling, "Adam": falling[:1, :7]})
-    with Image.open(tmp_path / "plot.png") as image:
-        pixels = np.array(image.convert("RGB")).astype(int)
-    for color in ((0x00, 0x72, 0xB2), (0xE6, 0x9F, 0x00)):
-        assert (np.abs(pixels - color).max(axis=-1) < 8).sum() > 100
 
 
 def test_importing_the_module_leaves_matplotlib_alone():
