@@ -54,7 +54,8 @@ def measure(
 
     measured = segmented & (depth > 0) & jnp.isfinite(depth)
     points = camera.unproject(intrinsics, jnp.where(measured, depth, jnp.nan))
-    hits = _count(*_affine(*voxel_from_camera, *jnp.moveaxis(points, -1, 0)), resolution)
+    x, y, z = _affine(*voxel_from_camera, *jnp.moveaxis(points, -1, 0))
+    hits = _count(x, y, z, resolution)
 
     center = jnp.arange(resolution) + 0.5
     centers = _affine(*camera_from_voxel, center[:, None, None], center[:, None], center)
@@ -97,7 +98,8 @@ def count_points(voxels: Float[Array, "n 3"], resolution: int = RESOLUTION) -> I
 
     Points outside the grid, and those that are not finite, are dropped.
     """
-    return _count(*voxels.T, resolution)
+    x, y, z = voxels.T
+    return _count(x, y, z, resolution)
 
 
 def _count(x, y, z, resolution: int) -> Int[Array, "x y z"]:

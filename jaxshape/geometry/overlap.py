@@ -1,8 +1,8 @@
 """How much two grids of voxels have in common."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Shaped
 
 AXES = (-3, -2, -1)
@@ -45,7 +45,7 @@ def _occupied(
             f"The {name} grid holds {grid.dtype}; booleans, or integers that are 0 or 1, are "
             "expected. Compare probabilities with 0.5, or logits with 0, first."
         )
-    if not isinstance(grid, jax.core.Tracer) and not np.isin(grid, (0, 1)).all():
+    if not isinstance(grid, Tracer) and not np.isin(grid, (0, 1)).all():
         raise ValueError(
             f"The {name} grid holds integers other than 0 and 1, such as labels; say which of them "
             "are occupied, for example by `grid > 0`."

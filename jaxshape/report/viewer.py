@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import trimesh
-import viser
-import viser.transforms
+import viser  # pyright: ignore[reportMissingImports] - of the extra `viewer`
+import viser.transforms  # pyright: ignore[reportMissingImports]
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
