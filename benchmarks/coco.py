@@ -37,7 +37,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.stats import fisher_exact
 
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json, write_text
 from jaxshape.search.batching import select
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.restarts import with_restarts
@@ -239,9 +239,7 @@ def run(options: Options) -> Results:
             if not file.exists():
                 print(f"{name:5}  d {dimension:2}  f {function:2}: ", end="", flush=True)
                 reached = _measure(searches[name], instances(function, dimension, budget))
-                file.parent.mkdir(parents=True, exist_ok=True)
-                with atomic_path(file) as path:
-                    path.write_text(json.dumps(reached))
+                write_json(file, reached)
             cells[name][str(function)] = json.loads(file.read_text())
     return found
 
@@ -271,8 +269,7 @@ def store(found: Results, folder: Path, name: str) -> Results:
     file = folder / f"{name}.json"
     earlier = json.loads(file.read_text()) if file.exists() else {}
     results = dict(sorted((earlier | found).items(), key=lambda item: int(item[0])))
-    with atomic_path(file) as path:
-        path.write_text(_compact(results))
+    write_text(file, _compact(results))
     (folder / f"{name}.md").write_text(report(results))
     figure = draw(results)
     for suffix in ("png", "svg"):

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 import tyro
 
+from figures import LINES, PAGE, draw_mean, save_column
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
+from jaxshape.report.figures import tidy
 from jaxshape.results.journal import Journal
-from jaxshape.results.study import (
+from study import (
     Claim,
     TestSet,
     column,

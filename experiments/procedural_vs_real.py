@@ -38,7 +38,7 @@ import jaxshape.data.chairs
 from jaxshape.data import meshes
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.chairs import random_chair
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
 
@@ -570,8 +570,7 @@ def main(config: Config) -> dict[str, Any] | None:
     start = time.perf_counter()
     results, sources, ious = run(config)
     results["seconds"] = round(time.perf_counter() - start)
-    with atomic_path(config.output) as temporary:
-        temporary.write_text(json.dumps(results, indent=1) + "\n")
+    write_json(config.output, results)
     plot(config.output.with_suffix(".png"), results, sources, ious)
     print(json.dumps(results["nearest neighbour IoU"], indent=1))
     return results

@@ -36,15 +36,15 @@ from scipy.spatial.transform import Rotation
 from jaxshape.data import meshes
 from jaxshape.data.boxes import Box
 from jaxshape.data.capture import Capture, capture
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import camera
+from jaxshape.geometry.overlap import iou
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import Mapper, Step, build_mapper
 from jaxshape.mapping.tracking.keyframes import PreparedFrame
 from jaxshape.mapping.tracking.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
-from jaxshape.results.metrics import iou
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
@@ -106,8 +106,7 @@ def run(config: Config) -> dict[str, Any]:
             done[futures[future]] = future.result()
             print(f"{number} of {len(missing)} seats", flush=True)
             metrics = {"settings": settings, "summary": summarize(done), "seats": done}
-            with atomic_path(path) as temporary:
-                temporary.write_text(json.dumps(metrics, indent=1))
+            write_json(path, metrics)
     return {"settings": settings, "summary": summarize(done), "seats": done}
 
 

@@ -27,17 +27,18 @@ import tyro
 from jaxtyping import Array, Bool
 from rich.progress import track
 
+from figures import LINES, PAGE, draw_mean, save_column
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped, sample_surface
 from jaxshape.geometry.grid import fit_box
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.report.figures import tidy
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds
-from jaxshape.results.study import (
+from study import (
     TUNED,
     Claim,
     Scores,

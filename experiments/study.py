@@ -16,14 +16,15 @@ import numpy as np
 from jaxtyping import Array, Key, Num
 from rich.progress import Progress, TimeElapsedColumn
 
+from figures import interval
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
 from jaxshape.data.meshes import Skipped
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
-from jaxshape.results.figures import interval
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import bounds, iou
+from jaxshape.results.metrics import bounds
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct, refiner_for
 
