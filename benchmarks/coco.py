@@ -38,6 +38,7 @@ from matplotlib.figure import Figure
 from scipy.stats import fisher_exact
 
 from jaxshape.files import write_json, write_text
+from jaxshape.report.palette import BLUE, ORANGE
 from jaxshape.search.batching import select
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.restarts import with_restarts
@@ -61,8 +62,8 @@ RESULTS = Path(__file__).parent / "results"
 ALGORITHMS = ("ours", "pycma")
 FUNCTIONS = range(1, 25)
 STYLES = {
-    "pycma": {"color": "#E69F00", "linewidth": 3},
-    "ours": {"color": "#0072B2", "linewidth": 1.2},
+    "pycma": {"color": ORANGE, "linewidth": 3},
+    "ours": {"color": BLUE, "linewidth": 1.2},
 }
 
 Restarts = Literal["ipop", "bipop"]
@@ -270,7 +271,7 @@ def store(found: Results, folder: Path, name: str) -> Results:
     earlier = json.loads(file.read_text()) if file.exists() else {}
     results = dict(sorted((earlier | found).items(), key=lambda item: int(item[0])))
     write_text(file, _compact(results))
-    (folder / f"{name}.md").write_text(report(results))
+    write_text(folder / f"{name}.md", report(results))
     figure = draw(results)
     for suffix in ("png", "svg"):
         figure.savefig(folder / f"{name}.{suffix}", dpi=200)

@@ -45,6 +45,7 @@ from jaxshape.mapping.tracking.keyframes import PreparedFrame
 from jaxshape.mapping.tracking.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
+from jaxshape.report.palette import BLUE, FOG, INK, ORANGE, SKY
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
@@ -238,7 +239,7 @@ def plot(metrics: dict[str, Any], path: Path) -> None:
     seats = list(metrics["seats"].values())
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     drift, shape = figure.subplots(1, 2)
-    colors = ["#B4BBC2", "#56B4E9", "#E69F00", "#0072B2", "#2B2F33"]
+    colors = [FOG, SKY, ORANGE, BLUE, INK]
     for system, color in zip(SYSTEMS, colors, strict=False):
         percent = [100 * s[system]["ate_mm"] / 1000 / s["diagonal"] for s in seats]
         share = np.arange(1, len(seats) + 1) / len(seats)
