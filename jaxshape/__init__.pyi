@@ -18,7 +18,7 @@ from .model.weights import ShapePrior, load_prior, save_prior
 from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
 from .results.report import write_report
 from .results.surface import surface, write_mesh
-from .search.cma import cma
+from .search.cma import CmaState, cma, cma_ask, cma_start, cma_tell
 from .search.config import RefineConfig
 from .search.methods import build_refiner
 from .search.methods.evosax import evosax_strategy
@@ -32,7 +32,17 @@ from .search.reconstruction import (
     reconstruct,
     refiner_for,
 )
-from .search.refiner import Distribution, Refiner, StopReason, Trace
+from .search.refiner import (
+    Candidate,
+    Distribution,
+    Refiner,
+    StopReason,
+    Trace,
+    finite_or_inf,
+    keep_better,
+    start_trace,
+    summarise,
+)
 from .search.restarts import with_restarts
 from .search.run import Refined, refine
 from .search.space import LatentSpace, raw, whitened
@@ -40,7 +50,9 @@ from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",
+    "Candidate",
     "Capture",
+    "CmaState",
     "Distribution",
     "GridFrame",
     "Intrinsics",
@@ -73,12 +85,16 @@ __all__ = [
     "capture",
     "chamfer_l1",
     "cma",
+    "cma_ask",
+    "cma_start",
+    "cma_tell",
     "compose",
     "decode",
     "encode",
     "evosax_strategy",
     "f_score",
     "find_start",
+    "finite_or_inf",
     "fit_box",
     "fit_box_isotropic",
     "fit_surface",
@@ -86,6 +102,7 @@ __all__ = [
     "gradient",
     "initialize",
     "iou",
+    "keep_better",
     "load",
     "load_prior",
     "measure",
@@ -111,6 +128,8 @@ __all__ = [
     "save_prior",
     "segment",
     "shape_scores",
+    "start_trace",
+    "summarise",
     "surface",
     "target",
     "trajectory",

@@ -51,6 +51,7 @@ def main() -> None:
     table = commands(Train(config=preset_in(sys.argv[1:])))
     command = tyro.cli(table, prog="jaxshape")
     prepare_process()
+    sys.path.append("")  # the current folder may hold a search of the user's own
     try:
         command.run()
     except (ValueError, OSError) as problem:

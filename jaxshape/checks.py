@@ -1,0 +1,92 @@
+"""Checks by which settings refuse wrong values: one sentence with what was given and what to give.
+
+A settings dataclass calls them in its `__post_init__`. Each raises a `ValueError` that begins with
+the name of the field, as in "population is 2; give a whole number, 3 or more."; the command line
+puts the name of its option there. Imports nothing of jaxshape.
+"""
+
+import math
+from collections.abc import Iterable
+from numbers import Integral, Real
+from typing import Any, NoReturn
+
+
+def refuse(name: str, value: Any, wanted: str) -> NoReturn:
+    """Say that a setting has a wrong value.
+
+    Args:
+        name: The field.
+        value: What it was given.
+        wanted: What it takes, as the end of a sentence that begins with "give".
+
+    Raises:
+        ValueError: Always.
+    """
+    raise ValueError(f"{name} is {value!r}; give {wanted}.")
+
+
+def one_of(name: str, value: Any, choices: Iterable[Any]) -> None:
+    """Refuse a value that is none of the choices.
+
+    Args:
+        name: The field.
+        value: What it was given.
+        choices: All that it takes.
+    """
+    choices = tuple(choices)
+    if value not in choices:
+        refuse(name, value, " or ".join(map(repr, choices)))
+
+
+def whole(name: str, value: Any, least: int) -> None:
+    """Refuse what is not a whole number from `least` up.
+
+    Args:
+        name: The field.
+        value: What it was given.
+        least: The smallest number it takes.
+    """
+    if not (_is_number(value) and isinstance(value, Integral) and int(value) >= least):
+        refuse(name, value, f"a whole number, {least} or more")
+
+
+def positive(name: str, value: Any, unit: str = "") -> None:
+    """Refuse what is not a finite number above 0.
+
+    Args:
+        name: The field.
+        value: What it was given.
+        unit: Its unit in the plural, as "metres"; empty where it has none.
+    """
+    if not (_is_number(value) and 0 < value < math.inf):
+        refuse(name, value, f"a number of {unit} above 0" if unit else "a number above 0")
+
+
+def at_least(name: str, value: Any, least: int | float) -> None:
+    """Refuse what is not a finite number from `least` up.
+
+    Args:
+        name: The field.
+        value: What it was given.
+        least: The smallest number it takes.
+    """
+    if not (_is_number(value) and least <= value < math.inf):
+        refuse(name, value, f"a number, {least:g} or more")
+
+
+def within(name: str, value: Any, low: int | float, high: int | float) -> None:
+    """Refuse what is not a number between two others, or one of them.
+
+    Args:
+        name: The field.
+        value: What it was given.
+        low: The smallest number it takes.
+        high: The largest number it takes.
+    """
+    if not (_is_number(value) and low <= value <= high):
+        refuse(name, value, f"a number from {low:g} to {high:g}")
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a real number; NaN is one, and fails every comparison."""
+    return isinstance(value, Real) and not isinstance(value, bool)
