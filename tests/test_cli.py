@@ -31,7 +31,7 @@ from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prio
 from jaxshape.results import evaluation
 from jaxshape.results.plots import plot_search
 from jaxshape.results.traces import read_search
-from jaxshape.search.methods import families
+from jaxshape.search.names import families
 
 COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
 

@@ -27,8 +27,8 @@ class Rebuild:
         tyro.conf.arg(
             metavar="METHOD",
             help="How the first code is searched on: encoder (not at all), "
-            f"{', '.join(families())}, a variant ({VARIANTS}), or a function of yours by its import "
-            "path, package.module:function.",
+            f"{', '.join(families())}, a variant ({VARIANTS}), or a function of yours by its "
+            "import path, package.module:function.",
         ),
     ] = "cma"
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()

@@ -64,6 +64,7 @@ UNUSABLE = {
     "mechanize": "it changes another optimiser",
     "sam": "it changes another optimiser",
     "schedule_free": "it changes another optimiser",
+    "sophia": "it estimates the Hessian, and the objective of a shape has first derivatives only",
 }
 """Optimisers that no name stands for, and why."""
 
@@ -123,10 +124,14 @@ def _optimizer(name: str, config: RefineConfig) -> optax.GradientTransformation:
     rate = config.step_size
     if rate is None:
         rate = STEP_SIZES[config.space] if name in LIKE_PLAIN_DESCENT else LEARNING_RATES.get(name)
-    argument = inspect.signature(factory).parameters[_rate_name(factory)]
+    arguments = inspect.signature(factory).parameters
+    argument = arguments[_rate_name(factory)]
     if rate is None and argument.default is argument.empty:
         rate = LEARNING_RATE
-    return factory() if rate is None else factory(**{argument.name: rate})
+    settings: dict[str, Any] = {} if rate is None else {argument.name: rate}
+    if "key" in arguments:  # of optimisers that add noise
+        settings["key"] = jax.random.PRNGKey(0)
+    return factory(**settings)
 
 
 def gradient(
@@ -178,13 +183,7 @@ def gradient(
         point = state.mean
         loss, slope = jax.value_and_grad(objective)(point)
         updates, optimizer_state = transformation.update(
-            slope,
-            state.optimizer_state,
-            point,
-            value=loss,
-            grad=slope,
-            value_fn=objective,  # for line searches
-            obj_fn=objective,  # for estimates of the Hessian
+            slope, state.optimizer_state, point, value=loss, grad=slope, value_fn=objective
         )
         best = keep_better(state.best, point[None], loss[None])
         moved = (optax.apply_updates(point, updates), optimizer_state)

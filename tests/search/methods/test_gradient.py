@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import optax.contrib
 import pytest
 from problems import ellipsoid, rosenbrock, run, run_batch, sphere
 
@@ -173,8 +174,10 @@ def test_names_of_no_optimiser_say_so(name):
 
 @pytest.mark.parametrize("name", UNUSABLE)
 def test_optimisers_that_no_name_stands_for_are_refused_with_the_reason(name):
-    assert hasattr(optax, name) or hasattr(optax.contrib, name)
-    with pytest.raises(ValueError, match=f"gradient:{name} is no method: it (clips|changes) .*"):
+    assert name in vars(optax) | vars(optax.contrib)
+    with pytest.raises(
+        ValueError, match=f"gradient:{name} is no method: it (clips|changes|estimates) .*"
+    ):
         build(name, 3, RefineConfig())
 
 

@@ -100,7 +100,9 @@ def test_a_function_goes_by_its_import_path(package, variant, left):
 def test_an_entry_point_goes_by_its_name_like_a_family(package):
     installed = package / "their_package-1.0.dist-info"
     installed.mkdir()
-    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: their_package\nVersion: 1.0\n")
+    (installed / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: their_package\nVersion: 1.0\n"
+    )
     (installed / "entry_points.txt").write_text(
         "[jaxshape.methods]\ntheirs = their_package.searches:build\n"
     )
@@ -141,7 +143,7 @@ def recipe(package):
     text = (Path(__file__).parents[3] / "CONTRIBUTING.md").read_text()
     section = text.split("## How to add a refiner")[1].split("\n## ")[0]
     (path,) = re.findall(r"`(\w+/\w+\.py)`", section)
-    (name,) = re.findall(r"--method (\S+)", section)
+    (name,) = re.findall(r"--method\s+([\w.:]+)", section)
     (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
     file = package / path
     file.parent.mkdir()
