@@ -130,7 +130,7 @@ def _optimizer(name: str, config: RefineConfig) -> optax.GradientTransformation:
         rate = LEARNING_RATE
     settings: dict[str, Any] = {} if rate is None else {argument.name: rate}
     if "key" in arguments:  # of optimisers that add noise
-        settings["key"] = jax.random.PRNGKey(0)
+        settings["key"] = 0
     return factory(**settings)
 
 
