@@ -18,9 +18,10 @@ from .model.weights import ShapePrior, load_prior, save_prior
 from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
 from .results.report import write_report
 from .results.surface import surface, write_mesh
-from .search.cma import CmaState, cma, cma_ask, cma_start, cma_tell
+from .search.cma import CmaState, cma_ask, cma_start, cma_tell
 from .search.config import RefineConfig
 from .search.methods import build_refiner
+from .search.methods.cma import cma
 from .search.methods.evosax import evosax_strategy
 from .search.methods.gradient import gradient
 from .search.methods.hybrid import polished

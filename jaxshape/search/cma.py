@@ -2,8 +2,9 @@
 
 Equations and symbols follow Hansen, "The CMA Evolution Strategy: A Tutorial" (arXiv:1604.00772);
 constants are those of pycma 4.5, the package the paper used, which adds a step-size damping for
-large populations. `cma_ask` and `cma_tell` are the algorithm, `stopping.py` says when it is over,
-`cma` binds them to a `Refiner`, and `restarts.py` starts it again with larger populations.
+large populations. `cma_ask` and `cma_tell` are the algorithm, `rates.py` has its constants,
+`stopping.py` says when it is over, `methods/cma.py` binds them to a `Refiner`, and `restarts.py`
+starts it again with larger populations.
 """
 
 import math
@@ -11,39 +12,23 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxshape.checks import positive, whole
 from jaxshape.search import stopping
 from jaxshape.search.batching import apply_if
 from jaxshape.search.config import is_array
+from jaxshape.search.rates import Constants, constants, default_population
 from jaxshape.search.refiner import (
     Candidate,
     Distribution,
-    Objective,
-    Refiner,
     StopReason,
     Trace,
     finite_or_inf,
     keep_better,
     start_trace,
-    summarise,
 )
 from jaxshape.search.stopping import History, Tolerances
-
-
-class Constants(NamedTuple):
-    """What follows from the dimension and the population (tutorial, Table 1)."""
-
-    weights: Float[Array, " capacity"]  # w_i; the positive ones sum to 1
-    mu_eff: Float[Array, ""]  # variance-effective number of parents
-    c_sigma: Float[Array, ""]  # rate of the step-size path
-    damping: Float[Array, ""]  # d_sigma
-    c_c: Float[Array, ""]  # rate of the covariance path
-    c_1: Float[Array, ""]  # rate of the rank-one update
-    c_mu: Float[Array, ""]  # rate of the rank-mu update
-    eigen_gap: Int[Array, ""]  # generations between eigendecompositions
 
 
 class CmaState(NamedTuple):
@@ -76,63 +61,6 @@ class CmaState(NamedTuple):
     history: History
 
 
-def default_population(dim: int) -> int:
-    """The number of candidates in one generation, 4 + floor(3 ln d)."""
-    return 4 + math.floor(3 * math.log(dim))
-
-
-def cma(
-    *,
-    dim: int,
-    sigma0: float,
-    population: int | None = None,
-    tolerances: Tolerances = Tolerances(),
-) -> Refiner:
-    """CMA-ES over points of `dim` numbers, starting from N(point, sigma0^2 I).
-
-    To start from another covariance, search in another space (`space.py`). `resume` keeps mean,
-    sigma and C of an earlier search; its paths led down another objective. With an own loop, or an
-    objective outside of JAX, use `cma_start`, `cma_ask` and `cma_tell`.
-
-    Args:
-        dim: Numbers in a point, 1 or more.
-        sigma0: First standard deviation, above 0, in units of the search space.
-        population: Candidates per iteration, 3 or more; None for pycma's 4 + floor(3 ln dim).
-        tolerances: When the search is over.
-
-    Returns:
-        The search.
-
-    Raises:
-        ValueError: A setting is outside its range.
-    """
-    size = checked_population(dim, sigma0, population)
-
-    def init(
-        key: Array, point: Float[Array, " d"], loss: Float[Array, ""]
-    ) -> tuple[CmaState, Trace]:
-        del key  # the start is the given point
-        return started(start(point, sigma0, dim, size, loss))
-
-    def step(key: Array, state: CmaState, objective: Objective) -> tuple[CmaState, Trace]:
-        points = cma_ask(key, state, size)
-        losses = jax.vmap(objective)(points)
-        rates = constants(dim, size, dtype=points.dtype)
-        state = move(state, points, losses, rates, sigma0, size, tolerances)
-        evaluations = 1 + size * state.generation
-        return state, summarise(state.best, points, losses, evaluations, distribution(state))
-
-    def resume(key: Array, state: CmaState, loss: Float[Array, ""]) -> tuple[CmaState, Trace]:
-        fresh, _ = init(key, state.best.point, loss)
-        kept = {name: getattr(state, name) for name in _DISTRIBUTION}
-        return started(fresh._replace(**kept))
-
-    return Refiner(init, step, resume)
-
-
-_DISTRIBUTION = ("mean", "sigma", "covariance", "basis", "scales")
-
-
 def checked_population(dim: int, sigma0: Float[Array, ""] | float, population: int | None) -> int:
     """The population, once the settings make a search; `ValueError` where they do not."""
     whole("dim", dim, 1)
@@ -142,48 +70,6 @@ def checked_population(dim: int, sigma0: Float[Array, ""] | float, population: i
         return default_population(dim)
     whole("population", population, 3)  # CMA-ES ranks candidates
     return population
-
-
-def constants(
-    dim: int,
-    population: int | Int[Array, ""],
-    capacity: int | None = None,
-    dtype: DTypeLike = float,
-) -> Constants:
-    """pycma's default constants for a dimension and a population (tutorial, Table 1).
-
-    The population may be traced if a static `capacity` bounds it: weights behind it are 0. `dtype`
-    is that of the points.
-    """
-    d, size = dim, jnp.asarray(population, dtype)
-    rank = jnp.arange(1, (population if capacity is None else capacity) + 1, dtype=size.dtype)
-    raw = jnp.where(rank <= size, jnp.log((size + 1) / 2) - jnp.log(rank), 0)  # Eq. 49
-    positive, negative = jnp.maximum(raw, 0), jnp.minimum(raw, 0)
-    mu_eff = positive.sum() ** 2 / (positive**2).sum()
-    mu_eff_negative = negative.sum() ** 2 / (negative**2).sum()
-
-    c_1 = jnp.minimum(1, size / 6) * 2 / ((d + 1.3) ** 2 + mu_eff)
-    c_mu = 2 * (0.25 + mu_eff + 1 / mu_eff - 2) / ((d + 2) ** 2 + mu_eff)
-    c_mu = jnp.minimum(1 - c_1, c_mu)
-    c_sigma = jnp.minimum(0.5, (mu_eff + 2) / (d + mu_eff + 3))
-
-    # Negative weights: no decay of C, a rate that fits their number, positive definite (50 - 53).
-    negative_sum = jnp.minimum(
-        jnp.minimum(1 + c_1 / c_mu, 1 + 2 * mu_eff_negative / (mu_eff + 2)),
-        (1 - c_1 - c_mu) / (c_mu * d),
-    )
-    # pycma's own term: it damps large populations, up to three times as hard in many dimensions.
-    many = max(1, 3 * (1 - 0.5 ** (d / 9))) * jnp.sqrt((mu_eff - 1) / (d + 1))
-    return Constants(
-        weights=positive / positive.sum() - negative_sum * negative / negative.sum(),
-        mu_eff=mu_eff,
-        c_sigma=c_sigma,
-        damping=1 + 2 * jnp.maximum(0, many - 1) + c_sigma,
-        c_c=(4 + mu_eff / d) / (d + 4 + 2 * mu_eff / d),
-        c_1=c_1,
-        c_mu=c_mu,
-        eigen_gap=jnp.ceil(1 / ((c_1 + c_mu) * d * 10)).astype(jnp.int32),
-    )
 
 
 def cma_start(

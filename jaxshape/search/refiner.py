@@ -89,15 +89,20 @@ class Trace(NamedTuple):
 
 
 class Refiner(NamedTuple):
-    """A search over one point; every state has `best` (a `Candidate`), `mean` and `stop`.
+    """A search over one point; batch it with `jax.vmap`.
 
-    `init(key, point, loss)` takes the loss of the first point, so that `best` is never worse than
-    the start and no iteration spends an evaluation on it. `step(key, state, objective)` is one
-    iteration. `mean` is where the search stands: the centre of the distribution it samples, or the
-    current iterate of a gradient method, whose loss may not have been evaluated. `stop` is a
-    `StopReason`; a search without criteria of its own leaves it at RUNNING. `resume(key, state,
-    loss)` starts again from the state of an earlier search whose objective has changed since, where
-    `loss` is that of `state.best.point` now; without it, `init` at that point takes its place.
+    Every state has `best` (a `Candidate`), `mean` and `stop`. `mean` is where the search stands:
+    the centre of the distribution it samples, or the current iterate of a gradient method, whose
+    loss may not have been evaluated. `stop` is a `StopReason`; a search without criteria of its
+    own leaves it at RUNNING. Numbers have the type of the point, counters are int32.
+
+    Attributes:
+        init: `(key, point, loss) -> state, trace`. It takes the loss of the first point, so that
+            `best` is never worse than the start and no iteration spends an evaluation on it.
+        step: `(key, state, objective) -> state, trace`, one iteration.
+        resume: `(key, state, loss) -> state, trace`, which starts again from the state of an
+            earlier search whose objective has changed since; `loss` is that of `state.best.point`
+            now. Without it, `init` at that point takes its place.
     """
 
     init: Callable[..., tuple[Any, Trace]]

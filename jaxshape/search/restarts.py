@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxshape.checks import one_of, whole
 from jaxshape.search import cma
 from jaxshape.search.batching import apply_if, select
+from jaxshape.search.rates import constants
 from jaxshape.search.refiner import (
     Candidate,
     Objective,
@@ -148,7 +149,7 @@ def with_restarts(
     def move(search, points, losses, run):
         """One generation of the whole population."""
         population = size * run.multiple
-        rates = cma.constants(dim, population, capacity, points.dtype)
+        rates = constants(dim, population, capacity, points.dtype)
         search = cma.move(search, points, losses, rates, run.sigma0, population, tolerances)
         return search, points, losses, run
 

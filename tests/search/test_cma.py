@@ -22,14 +22,9 @@ from problems import (  # noqa: F401
 )
 
 from jaxshape.search import stopping
-from jaxshape.search.cma import (
-    cma,
-    cma_ask,
-    cma_start,
-    cma_tell,
-    constants,
-    default_population,
-)
+from jaxshape.search.cma import cma_ask, cma_start, cma_tell
+from jaxshape.search.methods.cma import cma
+from jaxshape.search.rates import constants, default_population
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.stopping import Tolerances
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from problems import quick_compilation, rastrigin, sphere  # noqa: F401
 
-from jaxshape.search.cma import cma_tell, constants
+from jaxshape.search.cma import cma_tell
+from jaxshape.search.rates import constants
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.restarts import with_restarts
 

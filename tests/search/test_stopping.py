@@ -17,7 +17,9 @@ from problems import (  # noqa: F401
 )
 
 from jaxshape.search import stopping
-from jaxshape.search.cma import cma, cma_start, cma_tell, constants
+from jaxshape.search.cma import cma_start, cma_tell
+from jaxshape.search.methods.cma import cma
+from jaxshape.search.rates import constants
 from jaxshape.search.refiner import StopReason, advance
 from jaxshape.search.stopping import Tolerances
 

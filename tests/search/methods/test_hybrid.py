@@ -7,7 +7,7 @@ import optax
 import pytest
 from problems import ellipsoid, run_batch, sphere
 
-from jaxshape.search.cma import cma
+from jaxshape.search.methods.cma import cma
 from jaxshape.search.methods.gradient import gradient
 from jaxshape.search.methods.hybrid import polished
 from jaxshape.search.refiner import StopReason
