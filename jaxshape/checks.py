@@ -1,14 +1,28 @@
 """Checks by which settings refuse wrong values: one sentence with what was given and what to give.
 
-A settings dataclass calls them in its `__post_init__`. Each raises a `ValueError` that begins with
-the name of the field, as in "population is 2; give a whole number, 3 or more."; the command line
-puts the name of its option there. Imports nothing of jaxshape.
+A settings dataclass calls them in its `__post_init__`. Each raises a `BadSetting`, a `ValueError`
+that begins with the name of the field, as in "population is 2; give a whole number, 3 or more.";
+the command line puts the name of its option there. Imports nothing of jaxshape.
 """
 
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any, NoReturn
+
+
+class BadSetting(ValueError):
+    """A setting has a wrong value.
+
+    Attributes:
+        name: The field.
+        value: What it was given.
+        wanted: What it takes, as the end of a sentence that begins with "give".
+    """
+
+    def __init__(self, name: str, value: Any, wanted: str) -> None:
+        super().__init__(f"{name} is {value!r}; give {wanted}.")
+        self.name, self.value, self.wanted = name, value, wanted
 
 
 def refuse(name: str, value: Any, wanted: str) -> NoReturn:
@@ -20,9 +34,9 @@ def refuse(name: str, value: Any, wanted: str) -> NoReturn:
         wanted: What it takes, as the end of a sentence that begins with "give".
 
     Raises:
-        ValueError: Always.
+        BadSetting: Always.
     """
-    raise ValueError(f"{name} is {value!r}; give {wanted}.")
+    raise BadSetting(name, value, wanted)
 
 
 def one_of(name: str, value: Any, choices: Iterable[Any]) -> None:
