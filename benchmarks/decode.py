@@ -12,13 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxshape as js
 from benchmarks import problems
 from benchmarks.harness import Metric, alternate, compiled, difference, fastest, optional, speedup
 from benchmarks.problems import PRECISIONS, Problem
 from jaxshape.model.autoencoder import architecture_of
-from jaxshape.model.config import Architecture
-from jaxshape.search.config import Precision
+from jaxshape.model.config import Architecture, Precision
 
 POPULATIONS = (17, 64, 256)
 TARGETS = {"float32": 1.3, "bfloat16": 1.0}
@@ -45,8 +43,9 @@ def _compare(
     codes = problems.nearby_codes(problem, population)
     target = jax.tree.map(lambda x: x[0], problem.target)
     # Once per search, as PyTorch's folding is.
-    decoder = jax.jit(partial(js.prepare_decoder, dtype=precision))(problem.prior.params)
-    arguments = decoder, codes, target
+    prior = problem.prior
+    prepare = partial(prior.model.prepare, grids=None, precision=precision)
+    arguments = prior.model, jax.jit(prepare)(prior.params), codes, target
     ours, compile_seconds = compiled(problems.score, *arguments)
     functions = {"jaxshape": lambda: ours(*arguments)}
     variants = torch_scores(problem, precision)
@@ -59,7 +58,7 @@ def _compare(
 
     name = f"decode/{precision}/{population}"
     median = float(np.median(seconds["jaxshape"]))
-    times_limit = median * rate / (population * useful_flops(architecture_of(problem.prior.params)))
+    times_limit = median * rate / (population * useful_flops(architecture_of(prior.params)))
     metrics = [
         Metric(f"{name}/compile", compile_seconds, "s"),
         Metric(f"{name}/jaxshape", 1e3 * median, "ms"),

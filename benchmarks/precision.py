@@ -9,7 +9,7 @@ import jaxshape as js
 from benchmarks import problems
 from benchmarks.harness import Metric
 from benchmarks.problems import PRECISIONS, Problem
-from jaxshape.search.config import Precision
+from jaxshape.model.config import Precision
 
 OBJECTS_AT_A_TIME = 16
 

@@ -11,9 +11,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 import jaxshape as js
 from jaxshape.data.capture import camera_distance
-from jaxshape.model.weights import ShapePrior
-from jaxshape.search.config import Precision
-from jaxshape.search.objective import Target
+from jaxshape.model.config import Precision
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.search.objective import evaluation
+from jaxshape.search.residuals import Target
 from jaxshape.search.run import Refined
 from jaxshape.search.space import whitened
 
@@ -43,11 +44,11 @@ def chairs(count: int, frames: int = 4) -> Problem:
     F, M = js.occupied(measured), js.occluded(measured)
 
     @jax.jit
-    def start(params, F, M):
-        code = js.encode(params, F)
-        return code, js.target(F, M, js.decode(params, code))
+    def start(prior, grids):
+        code = js.encode(prior, grids)
+        return code, jax.vmap(js.BALANCED.target)(grids, js.decode(prior, code))
 
-    return Problem(prior, F, M, surface, *start(prior.params, F, M))
+    return Problem(prior, F, M, surface, *start(prior, js.Grids(F, M)))
 
 
 def _look_at(seed: int, frames: int) -> tuple[js.Measurement, Bool[Array, "x y z"]]:
@@ -73,10 +74,12 @@ def nearby_codes(problem: Problem, count: int, seed: int = 0) -> Float[Array, "n
 
 
 def score(
-    decoder: js.PreparedDecoder, codes: Float[Array, "n d"], target: Target
+    model: js.ShapeModel, decoder: js.Prepared, codes: Float[Array, "n d"], target: Target
 ) -> Float[Array, " n"]:
     """Eq. 7 of each candidate of one object, as a search scores them."""
-    return jax.vmap(js.objective, (None, 0, None))(decoder, codes, target)
+    own = decoder.own, target
+    how = evaluation(model, decoder, js.BALANCED, None, codes[0], own)
+    return jax.vmap(how.loss, (None, 0, None))(how.shared, codes, own)
 
 
 def search(
@@ -87,7 +90,7 @@ def search(
     refiner, space = js.refiner_for("cma", prior, config), whitened(prior)
 
     def run(keys, codes, targets):
-        return js.refine(keys, prior.params, codes, targets, refiner, iterations, space=space)
+        return js.refine(keys, prior, codes, targets, refiner, iterations, space=space)
 
     return run
 

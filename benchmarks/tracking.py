@@ -18,11 +18,11 @@ from benchmarks.rivals.variant import Variant
 from jaxshape.data import render
 from jaxshape.data.boxes import Box
 from jaxshape.geometry import camera
-from jaxshape.mapping import icp, tracking
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.incremental import Step, build_mapper
-from jaxshape.mapping.keyframes import Shot
-from jaxshape.mapping.views import View, view_of
+from jaxshape.mapping.map.mapper import Step, build_mapper
+from jaxshape.mapping.tracking import icp, registration
+from jaxshape.mapping.tracking.keyframes import PreparedFrame
+from jaxshape.mapping.tracking.views import DepthView, view_of
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
@@ -96,15 +96,15 @@ def our_ways() -> tuple[dict[str, Variant], float]:
     lens, flat = intrinsics(), jnp.ones((HEIGHT, WIDTH))
     prepare, seconds = compiled(view_of, flat, lens)
 
-    def one(reference: View, frame: View) -> jax.Array:
+    def one(reference: DepthView, frame: DepthView) -> jax.Array:
         match = icp.match_view(reference, still)
-        found = tracking.register(frame, everything, match, still)
+        found = registration.register(frame, everything, match, still)
         return found.T_reference_source.as_matrix()
 
-    def many(reference: View, frame: View) -> jax.Array:
+    def many(reference: DepthView, frame: DepthView) -> jax.Array:
         match = icp.match_view(reference, still)
-        guesses = tracking.guesses(still, jnp.array([0.0, 0.0, DISTANCE]))
-        found = tracking.register_from(frame, everything, match, guesses)
+        guesses = registration.guesses(still, jnp.array([0.0, 0.0, DISTANCE]))
+        found = registration.register_from(frame, everything, match, guesses)
         return found.T_reference_source.as_matrix()
 
     view = prepare(flat, lens)
@@ -138,7 +138,7 @@ def _timed(function: Callable, *arguments: Any) -> tuple[Any, float]:
 
 def _error(T: Any, truth: np.ndarray) -> tuple[float, float]:
     as_pose = lambda matrix: jaxlie.SE3.from_matrix(jnp.asarray(matrix, jnp.float32))  # noqa: E731
-    return tracking.displacement(as_pose(np.array(T)), as_pose(truth))
+    return registration.displacement(as_pose(np.array(T)), as_pose(truth))
 
 
 def _report(scene: str, problem: list[Pair], outcomes: dict[Any, list[Outcome]]) -> list[Metric]:
@@ -267,8 +267,8 @@ def _mapper():
     return build_mapper(prior, refiner, search, settings, TrackingConfig())
 
 
-def _shot(depth: np.ndarray) -> Shot:
-    return Shot(_view_of(jnp.asarray(depth), intrinsics()), jnp.ones(depth.shape, bool))
+def _shot(depth: np.ndarray) -> PreparedFrame:
+    return PreparedFrame(_view_of(jnp.asarray(depth), intrinsics()), jnp.ones(depth.shape, bool))
 
 
 _view_of = jax.jit(view_of)

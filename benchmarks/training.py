@@ -7,9 +7,8 @@ import numpy as np
 from benchmarks import problems
 from benchmarks.harness import Metric, alternate, compiled, difference, fastest, optional, speedup
 from benchmarks.problems import PRECISIONS
-from jaxshape.model.config import TrainConfig
+from jaxshape.model.config import Precision, TrainConfig
 from jaxshape.model.training import initial_state, train_step
-from jaxshape.search.config import Precision
 
 BATCH = 32
 LIMITS = {"float32": 1e-5, "bfloat16": 3e-3}

@@ -23,8 +23,8 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float, Int
 
-from jaxshape.model.autoencoder import decode
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.model.shapes import ShapePrior, decode
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import LINES, PAGE, PINK, RED, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
@@ -140,7 +140,7 @@ def iou_of(
     """IoU of the shapes of some codes for each case."""
 
     def score(codes: Float[Array, "case d"]) -> Float[Array, " case"]:
-        return iou(decode(prior.params, codes) > 0, case.surface)
+        return iou(decode(prior, codes) > 0, case.surface)
 
     return jax.lax.map(score, codes.swapaxes(0, 1)).T
 

@@ -26,8 +26,8 @@ import tyro
 from jaxtyping import Array, Float, Int
 from scipy.stats import spearmanr
 
-from jaxshape.model.autoencoder import decode
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.model.shapes import ShapePrior, decode
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.figures import (
     BLUE,
     GREY,
@@ -208,7 +208,7 @@ def contestant(search: Search, budgets: tuple[int, ...]) -> Contestant:
         iterations = jnp.sum(calls[:, None] <= jnp.array((0, *budgets))[:, None], axis=-1)
         codes = _after(iterations, found.first_code, found.path)
         return {
-            "iou": iou(decode(prior.params, codes) > 0, case.surface[:, None]),
+            "iou": iou(decode(prior, codes) > 0, case.surface[:, None]),
             "objective": _after(iterations, found.first_objective, found.trace.best_loss),
             "calls": calls[:, -1],
             "ended": found.stop != StopReason.BUDGET,  # by a criterion of its own

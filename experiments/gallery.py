@@ -27,7 +27,8 @@ import tyro
 
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, observe
 from jaxshape.results.figures import BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, save_column
 from jaxshape.results.journal import Journal

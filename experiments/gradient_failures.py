@@ -34,8 +34,9 @@ from rich.progress import track
 
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
-from jaxshape.model.autoencoder import decode
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model.shapes import ShapePrior, decode
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
 from jaxshape.results.figures import PAGE, save_column
 from jaxshape.results.journal import Journal
@@ -52,8 +53,8 @@ from jaxshape.results.study import (
     tuned,
 )
 from jaxshape.search.config import RefineConfig
-from jaxshape.search.objective import cross_entropy, target
 from jaxshape.search.reconstruction import reconstruct, refiner_for
+from jaxshape.search.residuals import LESS_FREE, cross_entropy, weigh
 
 RESULTS = Path(__file__).parent / "results"
 SHAPES = ("encoder", *TUNED)
@@ -283,10 +284,10 @@ def objectives_between(
     b: Float[Array, "case d"],
 ) -> Float[Array, "case point"]:
     """The objective along the straight line from one code to another."""
-    targets = target(case.occupied, case.occluded, decode(prior.params, first))
+    targets = weigh(Grids(case.occupied, case.occluded), decode(prior, first), LESS_FREE)
     share = jnp.linspace(0, 1, POINTS)[:, None]
     codes = a[:, None] + share * (b - a)[:, None]
-    return cross_entropy(decode(prior.params, codes), jax.tree.map(lambda x: x[:, None], targets))
+    return cross_entropy(decode(prior, codes), jax.tree.map(lambda x: x[:, None], targets))
 
 
 # ------------------------------------------------------------------ what the rows say
@@ -406,7 +407,7 @@ def panels(row: Rows, prior: ShapePrior, config: Config) -> Iterator[Any]:
     chair = next(one for one in subjects(config.test) if one.name == row["name"])
     occupied, occluded, surface = (np.asarray(x) for x in seen(chair, row["frames"]))
     codes = jnp.array([row["code"][name] for name in SHAPES])
-    shapes = np.asarray(decode(prior.params, codes) > 0)
+    shapes = np.asarray(decode(prior, codes) > 0)
     yield grid_panel("truth", surface, "truth", note=row["group"])
     yield measurement_panel("F", occupied, occluded, note=" ")
     for name, shape in zip(SHAPES, shapes, strict=True):

@@ -28,7 +28,8 @@ from rich.progress import track
 from jaxshape.data import meshes
 from jaxshape.data.split import hold_out
 from jaxshape.files import atomic_path
-from jaxshape.model.weights import ShapePrior, load_prior
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import load_prior
 from jaxshape.results.evaluation import Case, EvaluateConfig, observe
 from jaxshape.results.metrics import iou
 from jaxshape.results.pictures import COLORS, Panel, render_mesh, render_voxels

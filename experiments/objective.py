@@ -25,8 +25,9 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Bool, Float
 
-from jaxshape.model.autoencoder import decode, encode
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model.shapes import ShapePrior, decode, encode
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import BLUE, GREY, INK, ORANGE, PAGE, interval, save_column, tidy
 from jaxshape.results.journal import Journal
@@ -45,8 +46,8 @@ from jaxshape.results.study import (
 )
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
-from jaxshape.search.objective import Weights, target
-from jaxshape.search.reconstruction import compose, search_space, unlikeliness
+from jaxshape.search.reconstruction import code_penalty, compose, search_space
+from jaxshape.search.residuals import Weights, weigh
 from jaxshape.search.run import refine
 
 RESULTS = Path(__file__).parent / "results"
@@ -144,18 +145,19 @@ def by_residual(residual: Residual, prior: ShapePrior, iterations: int) -> Conte
     search = replace(residual.search, tolerance=0.0)
     refiner = build_refiner("gradient:adam", len(prior.code_mean), search)
     steps = iterations // len(residual.prior_scales)
-    penalty = unlikeliness(prior, search.prior_weight)
+    penalty = code_penalty(prior, search.prior_weight)
 
     def contest(keys, prior: ShapePrior, case: Case):
-        code = encode(prior.params, case.occupied)
-        anchor = logits = decode(prior.params, code)
+        grids = Grids(case.occupied, case.occluded)
+        code = encode(prior, grids)
+        anchor = logits = decode(prior, code)
         for scale in residual.prior_scales:
             alpha = scale if residual.alpha_is_printed else scale / printed_alpha(case.occluded)
             # Against what was measured as occupied; Adam does not care for a common factor.
             weights = Weights(1 / residual.occupied_weight, alpha / residual.occupied_weight)
-            targets = target(case.occupied, case.occluded, anchor, weights)
+            targets = weigh(grids, anchor, weights)
             found = refine(
-                keys, prior.params, code, targets, refiner, steps,
+                keys, prior, code, targets, refiner, steps,
                 space=search_space(prior, search), penalty=penalty,
             )  # fmt: skip
             code, logits = found.code, found.logits

@@ -28,13 +28,14 @@ from jaxshape.data.boxes import Box, read_box
 from jaxshape.data.sequences import Sequence as Recording
 from jaxshape.data.sequences import open_sequence
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.finding import find_start
-from jaxshape.mapping.incremental import Mapper, build_mapper
-from jaxshape.mapping.keyframes import Keyframe
-from jaxshape.mapping.recording import Progress, follow
-from jaxshape.mapping.segmentation import Prompt
-from jaxshape.mapping.state import State, grids_of
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.mapping.map.mapper import Mapper, build_mapper
+from jaxshape.mapping.map.recording import Progress, follow
+from jaxshape.mapping.map.state import MapState, grids_of
+from jaxshape.mapping.placement.finding import find_start
+from jaxshape.mapping.segmentation.segment import Prompt
+from jaxshape.mapping.tracking.keyframes import Keyframe
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
@@ -146,7 +147,7 @@ def _moments(
     prior: ShapePrior,
     mapper: Mapper,
     mapping: MappingConfig,
-) -> Iterator[tuple[Moment, State]]:
+) -> Iterator[tuple[Moment, MapState]]:
     """The map after each keyframe, and at last after the long search."""
     start = find_start(recording, prior, Prompt(), box=box, use_pose=True)
     chosen = range(start.index, len(recording), 4 if config.smoke else 1)
@@ -163,7 +164,7 @@ def _moments(
 
 
 def _moment(
-    progress: Progress, state: State, shape: Reconstruction, mapping: MappingConfig
+    progress: Progress, state: MapState, shape: Reconstruction, mapping: MappingConfig
 ) -> Moment:
     occupied, occluded = grids_of(state.measurement, mapping.min_hits)
     last = [log.index for log in progress.logs if log.status == "keyframe"][-1]
@@ -177,7 +178,7 @@ def _moment(
     )
 
 
-def _finished(moments: Sequence[tuple[Moment, State]], box: Box) -> Rebuilt:
+def _finished(moments: Sequence[tuple[Moment, MapState]], box: Box) -> Rebuilt:
     """The last moment takes the place of that before the long search."""
     by_keyframes = {one.keyframes: one for one, _ in moments}
     last, state = moments[-1]

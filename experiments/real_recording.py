@@ -30,15 +30,16 @@ import tyro
 from jaxshape.data.boxes import Box, read_box
 from jaxshape.data.sequences import Sequence, open_sequence
 from jaxshape.files import atomic_path
-from jaxshape.mapping import icp
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.finding import find_start
-from jaxshape.mapping.incremental import Mapper, build_mapper
-from jaxshape.mapping.keyframes import as_pose, prepare
-from jaxshape.mapping.recording import Progress, follow, trajectory
-from jaxshape.mapping.segmentation import Prompt
-from jaxshape.mapping.tracking import displacement
-from jaxshape.model.weights import ShapePrior, load_prior
+from jaxshape.mapping.map.mapper import Mapper, build_mapper
+from jaxshape.mapping.map.recording import Progress, follow, trajectory
+from jaxshape.mapping.placement.finding import find_start
+from jaxshape.mapping.segmentation.segment import Prompt
+from jaxshape.mapping.tracking import icp
+from jaxshape.mapping.tracking.keyframes import as_pose, prepare
+from jaxshape.mapping.tracking.registration import displacement
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.pictures import Panel, grid_panel, overview, render_mesh

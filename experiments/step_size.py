@@ -25,7 +25,8 @@ import tyro
 from jaxtyping import Array
 
 from jaxshape.geometry.grid import RESOLUTION
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import (
     BLUE,

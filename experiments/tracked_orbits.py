@@ -39,9 +39,9 @@ from jaxshape.data.capture import Capture, capture
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.incremental import Mapper, Step, build_mapper
-from jaxshape.mapping.keyframes import Shot
-from jaxshape.mapping.views import view_of
+from jaxshape.mapping.map.mapper import Mapper, Step, build_mapper
+from jaxshape.mapping.tracking.keyframes import PreparedFrame
+from jaxshape.mapping.tracking.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
 from jaxshape.results.metrics import iou
@@ -158,12 +158,12 @@ def _mapper(track: TrackingConfig, mapping: MappingConfig, iterations: int) -> M
 
 
 @jax.jit
-def _prepare(depth, intrinsics) -> Shot:
-    return Shot(view_of(depth, intrinsics), jnp.ones(depth.shape, bool))
+def _prepare(depth, intrinsics) -> PreparedFrame:
+    return PreparedFrame(view_of(depth, intrinsics), jnp.ones(depth.shape, bool))
 
 
 def _follow(
-    mapper: Mapper, shots: list[Shot], box: Box, seen: Capture, *, given: bool
+    mapper: Mapper, shots: list[PreparedFrame], box: Box, seen: Capture, *, given: bool
 ) -> dict[str, Any]:
     true = [jaxlie.SE3(pose) for pose in seen.T_object_camera.wxyz_xyz]
     state, step = mapper.init(shots[0], box, true[0], poses_are_given=given)

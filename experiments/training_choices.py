@@ -47,10 +47,10 @@ from jaxshape.data.dataset import (
 from jaxshape.data.inputs import draw_pair
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path
-from jaxshape.model.autoencoder import decode, encode
+from jaxshape.geometry.evidence import Grids
 from jaxshape.model.config import Architecture, TrainConfig
+from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.training import finished_prior, train
-from jaxshape.model.weights import ShapePrior
 from jaxshape.results.evaluation import EvaluateConfig, evaluate, summarize
 from jaxshape.results.metrics import iou
 from jaxshape.results.pictures import COLORS
@@ -161,7 +161,9 @@ def judge(
         scores = [s for s in evaluate(prior, models, scoring) if not isinstance(s, Skipped)]
         found[name] = summarize(scores, scoring)
     measured, surface = faulty
-    completed = jax.jit(lambda p, x: decode(p, encode(p, x)) > 0)(prior.params, measured)
+    completed = jax.jit(lambda prior, F: decode(prior, encode(prior, Grids(F, ~F))) > 0)(
+        prior, measured
+    )
     found["faulty inputs"] = float(np.mean(iou(completed, surface)))
     return found
 

@@ -31,7 +31,8 @@ from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped, sample_surface
 from jaxshape.geometry.grid import fit_box
-from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case
 from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal

@@ -3,18 +3,19 @@ from .data.chairs import random_chair
 from .data.meshes import load, read_meshes
 from .data.sequences import Trajectory, open_sequence, read_trajectory, write_trajectory
 from .geometry.camera import Intrinsics, orbit, random_views
+from .geometry.evidence import Grids, binary
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
 from .mapping.config import MappingConfig, TrackingConfig
-from .mapping.finding import find_start
-from .mapping.incremental import Mapper, build_mapper
-from .mapping.keyframes import Shot
-from .mapping.placement import Placement, PlacementConfig, place
-from .mapping.recording import Progress, follow, trajectory
-from .mapping.segmentation import Prompt, Segmentation, segment
-from .model.autoencoder import PreparedDecoder, decode, encode, initialize, prepare_decoder
+from .mapping.map.mapper import Mapper, build_mapper
+from .mapping.map.recording import Progress, follow, trajectory
+from .mapping.placement.finding import find_start
+from .mapping.placement.placing import Placement, PlacementConfig, place
+from .mapping.segmentation.segment import Prompt, Segmentation, segment
+from .mapping.tracking.keyframes import PreparedFrame
 from .model.config import Architecture
-from .model.weights import ShapePrior, load_prior, save_prior
+from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
+from .model.weights import load_prior, save_prior
 from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
 from .results.report import write_report
 from .results.surface import surface, write_mesh
@@ -25,7 +26,7 @@ from .search.methods.cma import cma
 from .search.methods.evosax import evosax_strategy
 from .search.methods.gradient import gradient
 from .search.methods.hybrid import polished
-from .search.objective import Target, Weights, objective, target
+from .search.objective import objective
 from .search.reconstruction import (
     Reconstruction,
     compose,
@@ -44,6 +45,18 @@ from .search.refiner import (
     start_trace,
     summarise,
 )
+from .search.residuals import (
+    BALANCED,
+    PAPER,
+    SOFT,
+    Residual,
+    Target,
+    Weights,
+    cross_entropy,
+    equation_7,
+    soft,
+    weigh,
+)
 from .search.restarts import with_restarts
 from .search.run import Refined, refine
 from .search.space import LatentSpace, raw, whitened
@@ -51,28 +64,34 @@ from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",
+    "BALANCED",
     "Candidate",
     "Capture",
     "CmaState",
     "Distribution",
     "GridFrame",
+    "Grids",
     "Intrinsics",
     "LatentSpace",
     "Mapper",
     "MappingConfig",
     "Measurement",
+    "PAPER",
     "Placement",
     "PlacementConfig",
-    "PreparedDecoder",
+    "Prepared",
+    "PreparedFrame",
     "Progress",
     "Prompt",
     "Reconstruction",
     "RefineConfig",
     "Refined",
     "Refiner",
+    "Residual",
+    "SOFT",
     "Segmentation",
+    "ShapeModel",
     "ShapePrior",
-    "Shot",
     "StopReason",
     "Target",
     "Tolerances",
@@ -80,6 +99,7 @@ __all__ = [
     "TrackingConfig",
     "Trajectory",
     "Weights",
+    "binary",
     "bounds",
     "build_mapper",
     "build_refiner",
@@ -90,8 +110,11 @@ __all__ = [
     "cma_start",
     "cma_tell",
     "compose",
+    "cross_entropy",
     "decode",
+    "decode_prepared",
     "encode",
+    "equation_7",
     "evosax_strategy",
     "f_score",
     "find_start",
@@ -101,7 +124,6 @@ __all__ = [
     "fit_surface",
     "follow",
     "gradient",
-    "initialize",
     "iou",
     "keep_better",
     "load",
@@ -117,7 +139,6 @@ __all__ = [
     "orbit",
     "place",
     "polished",
-    "prepare_decoder",
     "random_chair",
     "random_views",
     "raw",
@@ -129,11 +150,12 @@ __all__ = [
     "save_prior",
     "segment",
     "shape_scores",
+    "soft",
     "start_trace",
     "summarise",
     "surface",
-    "target",
     "trajectory",
+    "weigh",
     "whitened",
     "with_restarts",
     "write_mesh",

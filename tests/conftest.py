@@ -14,13 +14,13 @@ from jaxshape import cli
 from jaxshape.data.boxes import read_box
 from jaxshape.data.sequences import open_sequence
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.finding import find_start
-from jaxshape.mapping.incremental import build_mapper
-from jaxshape.mapping.recording import follow
-from jaxshape.mapping.segmentation import Prompt
+from jaxshape.mapping.map.mapper import build_mapper
+from jaxshape.mapping.map.recording import follow
+from jaxshape.mapping.placement.finding import find_start
+from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model.autoencoder import initialize
 from jaxshape.model.config import Architecture
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.search import objective, reconstruction, run
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for

@@ -14,7 +14,7 @@ from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.meshes import sample_surface
 from jaxshape.geometry import grid
 from jaxshape.model import weights
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.search import objective, reconstruction, run
 
 CODE = 6

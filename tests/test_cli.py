@@ -22,9 +22,10 @@ from jaxshape.data import dataset, sequences
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.split import hold_out
-from jaxshape.mapping import finding, incremental
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.segmentation import Prompt
+from jaxshape.mapping.map import mapper
+from jaxshape.mapping.placement import finding
+from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model import training, weights
 from jaxshape.model.config import PRESETS
 from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prior
@@ -183,8 +184,9 @@ def chair(tmp_path_factory):
         (("--first", "3"), "--first is 3, but there are 3 frames"),
         (("--depth-scale", "0"), "The depth scale is 0"),
         (("--click", "48", "20"), "The click is at 48, 20"),
-        (("--region", "30", "0", "20", "10"), "holds no pixel of the image of 48 x 48"),
-        (("--depth-range", "2", "1"), "The depth range is (2.0, 1.0)"),
+        (("--region", "60", "0", "70", "10"), "holds no pixel of the image of 48 x 48"),
+        (("--region", "30", "0", "20", "10"), "--region is 30.0 0.0 20.0 10.0"),
+        (("--depth-range", "2", "1"), "--depth-range is 2.0 1.0"),
         (("--min-hits", "0"), "--min-hits is 0"),
         (("--keyframe-angle", "0"), "--keyframe-angle is 0"),
         (("--keyframe-distance", "nan"), "--keyframe-distance is nan"),
@@ -383,7 +385,7 @@ def test_options_reach_the_map_and_the_search_of_the_object(
         asked.update(prompt=prompt, options=options)
         raise OSError("enough.")
 
-    monkeypatch.setattr(incremental, "build_mapper", build_mapper)
+    monkeypatch.setattr(mapper, "build_mapper", build_mapper)
     monkeypatch.setattr(finding, "find_start", find_start)
     prompt = ("--click", 10, 20, "--region", 0, 0, 40, 40.5, "--depth-range", 0.5, 3)
     tracking = ("--against", "keyframe", "--on", "object", "--min-inliers", 0.5, "--max-angle", 9)

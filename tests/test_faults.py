@@ -24,8 +24,8 @@ from orbit_recording import (
 from jaxshape.cli import recording as command
 from jaxshape.data.sequences import read_trajectory
 from jaxshape.geometry import fusion
-from jaxshape.mapping import incremental, recording
-from jaxshape.mapping.recording import trajectory
+from jaxshape.mapping.map import mapper, recording
+from jaxshape.mapping.map.recording import trajectory
 from jaxshape.results import output, report
 from jaxshape.results.progress import STATE
 
@@ -183,7 +183,7 @@ def run(run, monkeypatch, known):
 @pytest.fixture
 def compiled(monkeypatch, session_mapper):
     """The mapper of all tests in place of one to be compiled; its settings are its own."""
-    monkeypatch.setattr(incremental, "build_mapper", lambda *_, **__: session_mapper)
+    monkeypatch.setattr(mapper, "build_mapper", lambda *_, **__: session_mapper)
 
 
 def test_no_frame_can_be_read(run, folder, tmp_path, compiled):
@@ -258,7 +258,7 @@ import sys
 import numpy as np
 sys.path.insert(0, sys.argv.pop(1))
 from known_shape import install
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 with np.load(sys.argv.pop(1)) as file:
     params = dict(file)
 from jaxshape.results import output, report

@@ -10,7 +10,7 @@ from evosax.algorithms import CMA_ES
 from jaxtyping import Array, Float
 
 from jaxshape.model.autoencoder import LEAKY_SLOPE
-from jaxshape.search.objective import Target, cross_entropy
+from jaxshape.search.residuals import Target, cross_entropy
 
 
 class Decoder(nn.Module):

@@ -24,6 +24,7 @@ from tyro.conf import subcommand
 from jaxshape.cli.common import console
 from jaxshape.cli.inspecting import Inspect
 from jaxshape.cli.learning import Dataset, Train, preset_in
+from jaxshape.cli.options import RefusedSetting, refusing, reworded
 from jaxshape.cli.rebuild import Demo
 from jaxshape.cli.recording import Reconstruct
 from jaxshape.cli.scoring import Evaluate, Plot
@@ -50,13 +51,14 @@ def main() -> None:
     sys.path.append("")  # the current folder may hold a search of the user's own
     warnings.showwarning = lambda message, *_, **__: console.print(f"[yellow]warning[/] {message}")
     table = commands(Train(config=preset_in(sys.argv[1:])))
-    command = tyro.cli(table, prog="jaxshape")
-    prepare_process()
     try:
+        command = tyro.cli(table, prog="jaxshape", registry=refusing())
+        prepare_process()
         command.run()
-    except (ValueError, OSError) as problem:
+    except (RefusedSetting, ValueError, OSError) as problem:
         # Sentences for the user, by the convention of the package; anything else is a bug.
-        console.print(f"[red]jaxshape:[/] {escape(str(problem))}", soft_wrap=True)
+        said = reworded(problem) if isinstance(problem, ValueError) else str(problem)
+        console.print(f"[red]jaxshape:[/] {escape(said)}", soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         console.print("stopped")

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import tyro
 
 from jaxshape.cli.common import console, progress_bar, report_skipped, require
-from jaxshape.cli.options import Axes, Machines, checked_dataset, checked_training
+from jaxshape.cli.options import Axes, Machines, checked_training
 from jaxshape.cli.scoring import load_models, score
 from jaxshape.data.config import DatasetConfig
 from jaxshape.files import atomic_path
@@ -45,14 +45,11 @@ class Dataset:
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
         from jaxshape.data.dataset import TEST_SEEDS
-        from jaxshape.data.meshes import axes_to_canonical
 
         require(1 <= self.chairs <= TEST_SEEDS, f"--chairs is {self.chairs}; give 1 to 1000000.")
         require(self.workers >= 1, f"--workers is {self.workers}; give 1 or more.")
-        config = checked_dataset(self.config)
-        axes_to_canonical(config.up, config.front)
         objects: Sequence[Any] = list_meshes(self.meshes) if self.meshes else range(self.chairs)
-        build(self.output, objects, config, self.workers)
+        build(self.output, objects, self.config, self.workers)
 
 
 def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: int) -> None:
@@ -151,11 +148,9 @@ class Train:
         import jax
 
         from jaxshape.data.archives import list_meshes
-        from jaxshape.data.meshes import axes_to_canonical
         from jaxshape.data.split import hold_out
 
         assert self.meshes is not None
-        axes_to_canonical(self.axes.up, self.axes.front)
         require(
             jax.process_count() == 1,
             "Several processes cannot build one dataset; make it first with jaxshape dataset "

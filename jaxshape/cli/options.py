@@ -1,15 +1,18 @@
 """Options that several commands take, and the ranges in which they make sense."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
 from typing import Any
 
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+
 from jaxshape import process
+from jaxshape.checks import BadSetting
 from jaxshape.cli.common import require
-from jaxshape.data.config import Axis, DatasetConfig
-from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.data.config import Axis, check_axes
 from jaxshape.model.config import TrainConfig
-from jaxshape.search.config import RefineConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +23,9 @@ class Axes:
     """Axis of the meshes that points up."""
     front: Axis = "z"
     """Axis of the meshes along which the object's front looks."""
+
+    def __post_init__(self) -> None:
+        check_axes(self.up, self.front)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,62 +58,58 @@ class Machines:
             process.join_processes(self.coordinator, count, index)
 
 
-def checked_search(search: RefineConfig) -> RefineConfig:
-    """The options of a search, once each is in its range."""
-    _require_each(
-        search,
-        ("iterations", search.iterations >= 1, "1 or more"),
-        ("population", search.population >= 3, "3 or more"),
-        ("sigma0", _positive(search.sigma0), "a number above 0"),
-        ("step_size", search.step_size is None or _positive(search.step_size), "a number above 0"),
-        ("bound", search.bound is None or _positive(search.bound), "a number above 0"),
-        ("prior_weight", 0 <= search.prior_weight < math.inf, "0 or more"),
-        ("tolerance", 0 <= search.tolerance < math.inf, "0 or more"),
-        ("target", search.target is None or not math.isnan(search.target), "a number"),
-    )
-    return search
+class RefusedSetting(Exception):
+    """Settings refused what the parser gave them, in one sentence.
+
+    Not a `ValueError`, for the parser would make a page of its own of that.
+    """
 
 
-def checked_mapping(config: MappingConfig) -> MappingConfig:
-    """The options of a map, once each is in its range."""
-    _require_each(
-        config,
-        ("keyframe_angle", _positive(config.keyframe_angle), "a number of degrees above 0"),
-        ("keyframe_distance", _positive(config.keyframe_distance), "a number of metres above 0"),
-        ("min_hits", config.min_hits >= 1, "1 or more"),
-        ("keyframe_iterations", config.keyframe_iterations >= 1, "1 or more"),
-    )
-    return config
+def reworded(problem: ValueError) -> str:
+    """The sentence of a refusal, with the option in place of the field."""
+    if not isinstance(problem, BadSetting):
+        return str(problem)
+    value = problem.value
+    given = " ".join(map(str, value)) if isinstance(value, tuple) else value
+    return f"--{problem.name.replace('_', '-')} is {given}; give {problem.wanted}."
 
 
-def checked_tracking(config: TrackingConfig) -> TrackingConfig:
-    """The options of tracking, once each is in its range."""
-    _require_each(
-        config,
-        ("min_inliers", 0 <= config.min_inliers <= 1, "a share from 0 to 1"),
-        ("sure_inliers", 0 <= config.sure_inliers <= 1, "a share from 0 to 1"),
-        ("min_overlap", 0 <= config.min_overlap <= 1, "a share from 0 to 1"),
-        ("max_angle", _positive(config.max_angle), "a number of degrees above 0"),
-        ("max_distance", _positive(config.max_distance), "a number of metres above 0"),
-    )
-    return config
+def refusing() -> ConstructorRegistry:
+    """Rules for the parser, by which the refusals of settings end in `RefusedSetting`."""
+    registry, asked = ConstructorRegistry(), []
+
+    @registry.struct_rule
+    def rule(info: StructTypeInfo) -> Any:
+        if asked or not hasattr(info.type, "__post_init__"):
+            return None
+        asked.append(info)  # so that the rules of the parser answer, not this one again
+        try:
+            spec = ConstructorRegistry.get_struct_spec(info)
+        finally:
+            asked.pop()
+        if not isinstance(spec, StructConstructorSpec):
+            return spec
+        return replace(spec, instantiate=_refusing(spec.instantiate))
+
+    return registry
 
 
-def checked_dataset(config: DatasetConfig) -> DatasetConfig:
-    """The options of a dataset, once each is in its range."""
-    _require_each(
-        config,
-        ("views", config.views >= 1, "1 or more"),
-        ("noisy", 0 <= config.noisy <= 1, "a share from 0 to 1"),
-        ("seed", config.seed >= 0, "a number that is not negative"),
-    )
-    return config
+def _refusing(build: Callable[..., Any]) -> Callable[..., Any]:
+    """A constructor whose `ValueError` ends in `RefusedSetting`."""
+
+    @wraps(build)
+    def built(*values: Any, **fields: Any) -> Any:
+        try:
+            return build(*values, **fields)
+        except ValueError as problem:
+            raise RefusedSetting(reworded(problem)) from problem
+
+    return built
 
 
 def checked_training(config: TrainConfig) -> TrainConfig:
     """The options of a training run, once each is in its range."""
-    sizes, inputs = config.architecture, config.inputs
-    shares = ("complete", "pose_error", "missing", "segmentation")
+    sizes = config.architecture
     _require_each(
         config,
         ("steps", config.steps >= 1, "1 or more"),
@@ -124,12 +126,6 @@ def checked_training(config: TrainConfig) -> TrainConfig:
         ("encoder", min(sizes.encoder) >= 1, "four numbers of channels from 1 up"),
         ("decoder", min(sizes.decoder) >= 1, "three numbers of channels from 1 up"),
         ("code", sizes.code >= 2, "2 or more"),
-    )
-    _require_each(
-        inputs,
-        ("max_views", inputs.max_views >= 1, "1 or more"),
-        ("scale", 0 <= inputs.scale < 1, "a share from 0 to below 1"),
-        *((name, 0 <= getattr(inputs, name) <= 1, "a share from 0 to 1") for name in shares),
     )
     return config
 

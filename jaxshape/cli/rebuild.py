@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import tyro
 
 from jaxshape.cli.common import console, require
-from jaxshape.cli.options import checked_search
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import families
 
@@ -42,8 +41,8 @@ class Rebuild:
         from jaxshape.model.weights import load_prior
         from jaxshape.search.reconstruction import refiner_for
 
-        config, prior = checked_search(self.search), load_prior(self.weights)
-        return prior, refiner_for(self.method, prior, config), config
+        prior = load_prior(self.weights)
+        return prior, refiner_for(self.method, prior, self.search), self.search
 
     def settings(self) -> dict[str, Any]:
         """What result.json says of the search."""

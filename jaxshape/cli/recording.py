@@ -9,7 +9,6 @@ import tyro
 from tyro.conf import Positional
 
 from jaxshape.cli.common import console, progress_bar, require
-from jaxshape.cli.options import checked_mapping, checked_tracking
 from jaxshape.cli.rebuild import Rebuild, report_objective
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 
@@ -62,10 +61,10 @@ class Reconstruct(Rebuild):
 
         from jaxshape.data.boxes import read_box
         from jaxshape.data.sequences import open_sequence
-        from jaxshape.mapping.finding import find_start
-        from jaxshape.mapping.incremental import build_mapper
-        from jaxshape.mapping.recording import follow
-        from jaxshape.mapping.segmentation import Prompt, check_prompt
+        from jaxshape.mapping.map.mapper import build_mapper
+        from jaxshape.mapping.map.recording import follow
+        from jaxshape.mapping.placement.finding import find_start
+        from jaxshape.mapping.segmentation.segment import Prompt, check_prompt
         from jaxshape.model.weights import fingerprint
         from jaxshape.results.progress import (
             load_state,
@@ -78,7 +77,6 @@ class Reconstruct(Rebuild):
 
         require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
         require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")
-        mapping, tracking = checked_mapping(self.mapping), checked_tracking(self.tracking)
         prior, refiner, search = self.prepare()
         sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
         require(
@@ -89,9 +87,9 @@ class Reconstruct(Rebuild):
         check_prompt(prompt, sequence.shape)
         box = read_box(self.box) if self.box else None
         use_poses = self._use_poses(sequence)
-        mapper = build_mapper(prior, refiner, search, mapping, tracking, seed=self.seed)
+        mapper = build_mapper(prior, refiner, search, self.mapping, self.tracking, seed=self.seed)
         figures: dict[str, Any] = {"object": str(self.frames), **self.settings()}
-        figures |= {"mapping": asdict(mapping), "tracking": asdict(tracking)}
+        figures |= {"mapping": asdict(self.mapping), "tracking": asdict(self.tracking)}
         settings = figures | {
             "box": None if box is None else [x.tolist() for x in box],
             "prompt": asdict(prompt),
@@ -103,7 +101,7 @@ class Reconstruct(Rebuild):
         earlier = None
         if not self.fresh:
             earlier = load_state(
-                self.output, sequence, prior, settings, isotropic=mapping.isotropic
+                self.output, sequence, prior, settings, isotropic=self.mapping.isotropic
             )
         if earlier is None:
             with console.status("finding the object"):
@@ -140,7 +138,7 @@ class Reconstruct(Rebuild):
                 if time.perf_counter() - written > _SECONDS_BETWEEN_WRITES:
                     seconds = {"seconds": round(time.perf_counter() - start, 2)}
                     write_progress(
-                        self.output, sequence, progress, figures | seconds, mapping.min_hits,
+                        self.output, sequence, progress, figures | seconds, self.mapping.min_hits,
                         running=True,
                     )  # fmt: skip
                     written = time.perf_counter()
@@ -148,10 +146,10 @@ class Reconstruct(Rebuild):
         with console.status("searching the space of shapes"):
             state, shape = mapper.finish(progress.state)
         progress = progress._replace(state=state, shape=shape)
-        require_measured(observation_of(state, mapping.min_hits).occupied)
+        require_measured(observation_of(state, self.mapping.min_hits).occupied)
         figures["seconds"] = round(time.perf_counter() - start, 2)
         result = write_progress(
-            self.output, sequence, progress, figures, mapping.min_hits, running=False
+            self.output, sequence, progress, figures, self.mapping.min_hits, running=False
         )
         self._conclude(progress, result)
         remove_state(self.output)

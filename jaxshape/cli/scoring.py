@@ -14,7 +14,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from jaxshape.cli.common import progress_bar, report_skipped, require
-from jaxshape.cli.options import Axes, checked_numbers, checked_search
+from jaxshape.cli.options import Axes, checked_numbers
 from jaxshape.files import atomic_path
 from jaxshape.search.config import RefineConfig
 
@@ -51,7 +51,6 @@ class Evaluate:
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
         from jaxshape.data.dataset import TEST_SEEDS
-        from jaxshape.data.meshes import axes_to_canonical
         from jaxshape.model.weights import load_prior
         from jaxshape.results import evaluation
 
@@ -60,10 +59,9 @@ class Evaluate:
             methods=tuple(self.methods.split(",")),
             noise=self.noise,
             ceiling=self.ceiling,
-            refine=checked_search(self.search),
+            refine=self.search,
             seed=self.seed,
         )
-        axes_to_canonical(self.axes.up, self.axes.front)
         require(
             (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
             "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",

@@ -1,9 +1,29 @@
 """Settings of a dataset and of the inputs drawn from it; free of JAX, for the command line."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
+
+from jaxshape import checks
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+def check_axes(up: str, front: str) -> None:
+    """Refuse axes that say nothing of how an object is turned.
+
+    Args:
+        up: Axis that points up, as "y" or "-z".
+        front: Axis along which the object's front looks.
+
+    Raises:
+        ValueError: Where one of them is no axis, or both lie on one line.
+    """
+    checks.one_of("up", up, get_args(Axis))
+    checks.one_of("front", front, get_args(Axis))
+    if up[-1] == front[-1]:
+        raise ValueError(
+            f"up is {up!r} and front is {front!r}, but they must be perpendicular; give another."
+        )
 
 
 @dataclass(frozen=True)
@@ -20,6 +40,12 @@ class DatasetConfig:
     """Axis of the mesh files along which the object's front looks."""
     seed: int = 0
     """Of views, noise and surface samples."""
+
+    def __post_init__(self) -> None:
+        checks.whole("views", self.views, 1)
+        checks.within("noisy", self.noisy, 0, 1)
+        check_axes(self.up, self.front)
+        checks.whole("seed", self.seed, 0)
 
 
 @dataclass(frozen=True)
@@ -40,3 +66,11 @@ class InputConfig:
     """Share of the views that lack a region, as where a sensor returns nothing."""
     segmentation: float = 0.02
     """Share of the views whose mask is wrong: it cuts a piece off, or takes in some background."""
+
+    def __post_init__(self) -> None:
+        checks.whole("max_views", self.max_views, 1)
+        checks.one_of("mirror", self.mirror, (True, False))
+        for share in ("complete", "scale", "pose_error", "missing", "segmentation"):
+            checks.within(share, getattr(self, share), 0, 1)
+        if self.scale == 1:
+            checks.refuse("scale", self.scale, "a number below 1, or nothing is left")

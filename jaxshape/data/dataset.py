@@ -46,7 +46,7 @@ class DatasetError(ValueError):
     """A dataset folder cannot be read or continued."""
 
 
-class Progress(NamedTuple):
+class BuildProgress(NamedTuple):
     """How much of a build is done."""
 
     objects: int
@@ -114,7 +114,7 @@ def build_dataset(
     config: DatasetConfig = DatasetConfig(),
     *,
     workers: int | None = None,
-) -> Iterator[Progress]:
+) -> Iterator[BuildProgress]:
     """Write the shards that are missing, in parallel processes, yielding progress after each.
 
     Raises `DatasetError` when the folder holds a dataset of other objects or settings.
@@ -126,7 +126,7 @@ def build_dataset(
     missing = [shard for shard in shards if not _shard_path(folder, shard[0], "json").exists()]
     done = sum(len(items) for _, items in shards) - sum(len(items) for _, items in missing)
     skipped = [s for n, _ in shards if (n, _) not in missing for s in _read_names(folder, n)[1]]
-    yield Progress(done, len(objects), skipped)
+    yield BuildProgress(done, len(objects), skipped)
     if not missing:
         return
     write = partial(_write_shard, folder, config)
@@ -136,7 +136,7 @@ def build_dataset(
         for future in as_completed(futures):
             skipped = skipped + future.result()
             done += len(futures[future][1])
-            yield Progress(done, len(objects), skipped)
+            yield BuildProgress(done, len(objects), skipped)
 
 
 def _write_shard(

@@ -17,6 +17,7 @@ import trimesh
 from jaxtyping import Float
 
 from jaxshape.data.archives import Beside, MeshSource, TooLarge, list_meshes, read_bytes
+from jaxshape.data.config import check_axes
 from jaxshape.data.orientation import apparent_up
 
 __all__ = [
@@ -166,11 +167,7 @@ def canonical(mesh: trimesh.Trimesh, *, up: str = "y", front: str = "z") -> trim
 
 def axes_to_canonical(up: str, front: str) -> Float[np.ndarray, "3 3"]:
     """Return the rotation that maps the axis named `up` to +y and the one named `front` to +z."""
-    for name, axis in (("up", up), ("front", front)):
-        if not re.fullmatch("-?[xyz]", axis):
-            raise ValueError(f"{name} must be one of x, y, z, -x, -y, -z, but is {axis!r}.")
-    if up[-1] == front[-1]:
-        raise ValueError(f"up and front must be perpendicular, but are {up!r} and {front!r}.")
+    check_axes(up, front)
     y, z = ((-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[-1])]
             for axis in (up, front))  # fmt: skip
     return np.stack([np.cross(y, z), y, z])

@@ -4,7 +4,7 @@ Each pixel casts one ray through its centre; the first triangle it meets hides a
 depth is that of the ray's intersection with the plane of that triangle.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import jaxlie
@@ -12,7 +12,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from jaxshape.geometry import camera
+from jaxshape import checks
+from jaxshape.geometry import camera, sensor
 from jaxshape.geometry.camera import Intrinsics
 
 IMAGE_SIZE = 96
@@ -22,23 +23,30 @@ DISTANCE = 1.5
 """How far the camera stands from the object's centre, in diagonals of its bounding box."""
 
 
-class SensorNoise(NamedTuple):
+@dataclass(frozen=True)
+class SensorNoise:
     """The faults of a structured-light sensor such as the first Kinect.
 
-    Standard deviations grow with depth as Khoshelham and Elberink (Sensors, 2012) and Nguyen, Izadi
-    and Lovell (3DIMPVT, 2012) measured; depths come in steps that grow with its square.
+    Standard deviations and steps grow with the square of depth, see `jaxshape.geometry.sensor`.
     """
 
-    axial: float = 1.4e-3
+    axial: float = sensor.AXIAL
     """Standard deviation along the ray, in metres at 1 m; grows with the square of depth."""
     lateral: float = 0.3
     """Standard deviation across the image, in pixels (0.8 of the Kinect's, which are smaller)."""
-    quantization: float = 2.8e-3
+    quantization: float = sensor.STEP
     """Step of the measured depth, in metres at 1 m; grows with the square of depth."""
     dropout: float = 0.3
     """Probability that a pixel at a depth edge is lost."""
     grazing: float = 80.0
     """Surfaces seen at more than this angle, in degrees, from their normal are lost."""
+
+    def __post_init__(self) -> None:
+        checks.at_least("axial", self.axial, 0)
+        checks.at_least("lateral", self.lateral, 0)
+        checks.positive("quantization", self.quantization, "metres")
+        checks.within("dropout", self.dropout, 0, 1)
+        checks.within("grazing", self.grazing, 0, 180)
 
 
 def fit_intrinsics(

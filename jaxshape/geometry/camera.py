@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 
@@ -26,6 +27,18 @@ def intrinsics_for(field_of_view: float, image_size: int) -> Intrinsics:
     focal = 0.5 * image_size / jnp.tan(jnp.deg2rad(field_of_view) / 2)
     center = jnp.asarray(image_size / 2, focal.dtype)
     return Intrinsics(focal, focal, center, center)
+
+
+def intrinsics_of(K: Float[np.ndarray, "3 3"]) -> Intrinsics:
+    """The camera of a host's camera matrix.
+
+    Args:
+        K: fx 0 cx / 0 fy cy / 0 0 1, in pixels.
+
+    Returns:
+        The same numbers in float32.
+    """
+    return Intrinsics(*jnp.float32([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
 
 
 def project(
@@ -55,6 +68,25 @@ def unproject(
     x = (u - intrinsics.cx) / intrinsics.fx * depth
     y = ((v - intrinsics.cy) / intrinsics.fy)[:, None] * depth
     return jnp.stack([x, y, depth], axis=-1)
+
+
+def look_up(
+    image: Float[Array, "h w *channels"], pixels: Float[Array, "*batch 2"]
+) -> Float[Array, "..."]:
+    """What an image holds at the pixel in which each image point lies.
+
+    Args:
+        image: Any number of values for each pixel, as a depth image or an image of points.
+        pixels: Image coordinates `(u, v)`, in pixels.
+
+    Returns:
+        The values, of shape `[*batch, *channels]`; 0, nothing known, outside the image.
+    """
+    h, w = image.shape[:2]
+    column, row = pixels[..., 0], pixels[..., 1]
+    inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+    index = jnp.where(inside, row.astype(jnp.int32) * w + column.astype(jnp.int32), h * w)
+    return image.reshape(h * w, *image.shape[2:]).at[index].get(mode="fill", fill_value=0.0)
 
 
 def transform(T_a_b: jaxlie.SE3, points: Float[Array, "*batch n 3"]) -> Float[Array, "*batch n 3"]:

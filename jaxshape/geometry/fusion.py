@@ -5,6 +5,7 @@ associative and commutative with `nothing_measured()` as its identity, so frames
 a time, all at once, or cumulatively, and every way gives the same grids.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
-from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.geometry.grid import RESOLUTION, GridFrame, flat_index
 
 
 class Measurement(NamedTuple):
@@ -54,12 +55,12 @@ def measure(
 
     measured = segmented & (depth > 0) & jnp.isfinite(depth)
     points = camera.unproject(intrinsics, jnp.where(measured, depth, jnp.nan))
-    hits = _count(*_affine(*voxel_from_camera, *jnp.moveaxis(points, -1, 0)), resolution)
+    hits = _count(_affine(*voxel_from_camera, *jnp.moveaxis(points, -1, 0)), resolution)
 
     center = jnp.arange(resolution) + 0.5
     centers = _affine(*camera_from_voxel, center[:, None, None], center[:, None], center)
     pixels, center_depth = camera.project(intrinsics, jnp.stack(centers, axis=-1))
-    seen_through = (center_depth > 0) & (center_depth < _look_up(depth, pixels))
+    seen_through = (center_depth > 0) & (center_depth < camera.look_up(depth, pixels))
     return Measurement(hits, seen_through)
 
 
@@ -97,16 +98,12 @@ def count_points(voxels: Float[Array, "n 3"], resolution: int = RESOLUTION) -> I
 
     Points outside the grid, and those that are not finite, are dropped.
     """
-    return _count(*voxels.T, resolution)
+    return _count(voxels.T, resolution)
 
 
-def _count(x, y, z, resolution: int) -> Int[Array, "x y z"]:
-    """How many points fall into each voxel, from their coordinates."""
-    index, inside = 0, True
-    for coordinate in (x, y, z):
-        inside &= (coordinate >= 0) & (coordinate < resolution)  # False for NaN
-        index = index * resolution + coordinate.astype(jnp.int32)
-    index = jnp.where(inside, index, resolution**3).ravel()
+def _count(coordinates: Iterable[Float[Array, "..."]], resolution: int) -> Int[Array, "x y z"]:
+    """How many points fall into each voxel, from their x, y and z."""
+    index = flat_index(coordinates, resolution).ravel()
     hits = jnp.zeros(resolution**3, jnp.int32).at[index].add(1, mode="drop")
     return hits.reshape((resolution,) * 3)
 
@@ -114,14 +111,3 @@ def _count(x, y, z, resolution: int) -> Int[Array, "x y z"]:
 def _affine(matrix: Float[Array, "3 3"], shift: Float[Array, " 3"], x, y, z) -> list[Array]:
     """`matrix @ (x, y, z) + shift`, for coordinates that broadcast."""
     return [a * x + b * y + c * z + d for (a, b, c), d in zip(matrix, shift, strict=True)]
-
-
-def _look_up(
-    depth: Float[Array, "h w"], pixels: Float[Array, "*batch 2"]
-) -> Float[Array, "*batch"]:
-    """Depth at the pixel that holds each image point; 0, nothing known, outside the image."""
-    h, w = depth.shape
-    column, row = pixels[..., 0], pixels[..., 1]
-    inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
-    index = jnp.where(inside, row.astype(jnp.int32) * w + column.astype(jnp.int32), h * w)
-    return depth.ravel().at[index].get(mode="fill", fill_value=0.0)

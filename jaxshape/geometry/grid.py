@@ -4,10 +4,11 @@ Grids are indexed `[x, y, z]`. In voxel coordinates, voxel `i` covers `[i, i + 1
 axis and its centre is at `i + 0.5`.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 RESOLUTION = 32
 """Voxels along each axis of every grid (paper, section 2.2)."""
@@ -74,6 +75,26 @@ def object_from_voxel(
 ) -> Float[Array, "*batch n 3"]:
     """Voxel coordinates to object-frame points, in metres."""
     return frame.origin[..., None, :] + voxels * frame.voxel_size[..., None, :]
+
+
+def flat_index(
+    coordinates: Iterable[Float[Array, "..."]], resolution: int = RESOLUTION
+) -> Int[Array, "..."]:
+    """The voxel that holds each point, as an index into a raveled grid.
+
+    Args:
+        coordinates: x, y and z of the points, in voxels; each an array of its own, of one shape or
+            of shapes that broadcast, for that is one pass on CPU.
+        resolution: Voxels along each axis.
+
+    Returns:
+        Indices from 0; `resolution**3` for points that lie outside or are not finite.
+    """
+    index, inside = jnp.int32(0), jnp.array(True)
+    for coordinate in coordinates:
+        inside &= (coordinate >= 0) & (coordinate < resolution)  # False for NaN
+        index = index * resolution + coordinate.astype(jnp.int32)
+    return jnp.where(inside, index, resolution**3)
 
 
 def voxel_centers(frame: GridFrame, resolution: int = RESOLUTION) -> Float[Array, "*batch n 3"]:

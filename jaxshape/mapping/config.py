@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from jaxshape import checks
+
 
 @dataclass(frozen=True)
 class TrackingConfig:
@@ -24,6 +26,14 @@ class TrackingConfig:
     max_distance: float = 0.5
     """Metres from the expected pose beyond which a pose is not believed."""
 
+    def __post_init__(self) -> None:
+        checks.one_of("against", self.against, ("map", "keyframe"))
+        checks.one_of("on", self.on, ("scene", "object"))
+        for share in ("min_inliers", "sure_inliers", "min_overlap"):
+            checks.within(share, getattr(self, share), 0, 1)
+        checks.positive("max_angle", self.max_angle, "degrees")
+        checks.positive("max_distance", self.max_distance, "metres")
+
 
 @dataclass(frozen=True)
 class MappingConfig:
@@ -42,3 +52,11 @@ class MappingConfig:
     """Depth points that make a voxel occupied; the paper has 1, more suppress stray points."""
     keyframe_iterations: int = 40
     """Steps of the search after each keyframe, from the code found so far."""
+
+    def __post_init__(self) -> None:
+        checks.positive("keyframe_angle", self.keyframe_angle, "degrees")
+        checks.positive("keyframe_distance", self.keyframe_distance, "metres")
+        for switch in ("realign", "isotropic"):
+            checks.one_of(switch, getattr(self, switch), (True, False))
+        checks.whole("min_hits", self.min_hits, 1)
+        checks.whole("keyframe_iterations", self.keyframe_iterations, 1)

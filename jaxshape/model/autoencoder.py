@@ -1,8 +1,8 @@
-"""The auto-encoder of the paper (section 2.2): 32^3 occupancy to a short code and back.
+"""The auto-encoder of the paper (section 2.2): occupancy to a short code and back.
 
-`encode` and `decode` are pure functions of the parameters and broadcast over leading axes. The
-parameters are the two Flax collections `params` and `batch_stats` of `AutoEncoder`; Flax itself is
-imported here and nowhere else.
+`AUTOENCODER` is its `ShapeModel`. The number of layers decides the resolution, 32^3 in the paper.
+The parameters are the two Flax collections `params` and `batch_stats` of `AutoEncoder`; Flax itself
+is imported here and nowhere else.
 """
 
 from functools import partial
@@ -15,8 +15,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from jaxshape.geometry.grid import RESOLUTION
-from jaxshape.model.chunks import in_chunks
+from jaxshape.geometry.evidence import Grids
 from jaxshape.model.config import Architecture
 from jaxshape.model.convolution import (
     KERNEL_SIZE,
@@ -26,10 +25,7 @@ from jaxshape.model.convolution import (
     upsample,
     upsample_prepared,
 )
-
-CODES_AT_A_TIME = 8
-"""Codes or grids that go through the network together on CPU: enough rows for its products, few
-enough that its memory stays small; layers that need fewer to stay in cache take them in turn."""
+from jaxshape.model.shapes import Precision, Prepared, ShapeModel
 
 NORM_EPSILON = 1e-5
 """Added to variances by batch normalisation, Flax's default."""
@@ -69,7 +65,10 @@ class AutoEncoder(nn.Module):
 
 
 class Encoder(nn.Module):
-    """32 -> 16 -> 8 -> 4 -> 2 by strided convolutions, then pooling and a 1^3 convolution."""
+    """32 -> 16 -> 8 -> 4 -> 2 by strided convolutions, then pooling and a 1^3 convolution.
+
+    Each further layer takes a grid of twice the resolution.
+    """
 
     architecture: Architecture
     dtype: DTypeLike
@@ -86,7 +85,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions."""
+    """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions; each further layer doubles again."""
 
     architecture: Architecture
     dtype: DTypeLike
@@ -129,32 +128,42 @@ def _normalize(x, train, axis, name):
 
 
 def initialize(key: PRNGKeyArray, architecture: Architecture = Architecture()) -> PyTree:
-    """Parameters and batch statistics of an untrained network."""
-    grid = jnp.zeros((1, *[RESOLUTION] * 3))
+    """Parameters and batch statistics of an untrained network.
+
+    Args:
+        key: Random key of the first weights.
+        architecture: Sizes of the network.
+    """
+    grid = jnp.zeros((1, *[architecture.resolution] * 3))
     # Under jit the forward pass, which Flax traces to find the shapes, is left out.
     return jax.jit(partial(AutoEncoder(architecture).init, train=False))(key, grid)
 
 
 def architecture_of(params: PyTree) -> Architecture:
-    """Read the sizes off the parameters."""
+    """Read the sizes off the parameters.
+
+    Args:
+        params: Those of an auto-encoder, as arrays or their shapes.
+    """
     encoder, decoder = params["params"]["encoder"], params["params"]["decoder"]
+    depth = sum(name.startswith("conv") for name in encoder)
     return Architecture(
-        encoder=tuple(encoder[f"conv{i}"].shape[-1] for i in range(4)),
-        decoder=tuple(decoder[f"conv{i}"].shape[-2] for i in range(3)),
+        encoder=tuple(encoder[f"conv{i}"].shape[-1] for i in range(depth)),
+        decoder=tuple(decoder[f"conv{i}"].shape[-2] for i in range(depth - 1)),
         code=decoder["conv0"].shape[-1],
     )
 
 
-def encode(
-    params: PyTree,
-    grid: Bool[Array, "*batch x y z"] | Float[Array, "*batch x y z"],
-    *,
-    dtype: DTypeLike = jnp.float32,
-) -> Float[Array, "*batch d"]:
-    """The code of a (partial) occupancy grid: the first code of a search (paper, section 3.1)."""
-    network = AutoEncoder(architecture_of(params), dtype)
-    apply = lambda grid: network.apply(params, grid, method="encode")  # noqa: E731
-    return _over_leading_axes(apply, grid.astype(jnp.float32), 3)
+def shapes(params: PyTree) -> PyTree:
+    """The arrays, as shapes, of a network of the sizes that the parameters seem to have."""
+    architecture = architecture_of(params)
+    return jax.eval_shape(lambda: initialize(jax.random.key(0), architecture))
+
+
+def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
+    """The code of F; M is not looked at."""
+    network = AutoEncoder(architecture_of(params))
+    return jnp.asarray(network.apply(params, grids.occupied.astype(jnp.float32), method="encode"))
 
 
 class PreparedDecoder(NamedTuple):
@@ -169,42 +178,30 @@ class PreparedDecoder(NamedTuple):
     """One per layer; the last is the output's, a scalar."""
 
 
-def prepare_decoder(params: PyTree, dtype: DTypeLike = jnp.float32) -> PreparedDecoder:
-    """Make a decoder ready for a search, with products in the given precision."""
+def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
+    """Fold the batch normalisation and transform the kernels of fast convolutions."""
+    del grids  # the decoder sees the code alone
     weights, statistics = params["params"]["decoder"], params["batch_stats"]["decoder"]
     kernels, biases = [], []
     layers = len([name for name in weights if name.startswith("conv")])
     for i in range(layers - 1):
         norm, seen = weights[f"norm{i}"], statistics[f"norm{i}"]
         scale = norm["scale"] * lax.rsqrt(seen["var"] + NORM_EPSILON)
-        kernels.append((weights[f"conv{i}"] * scale[:, None]).astype(dtype))
+        kernels.append((weights[f"conv{i}"] * scale[:, None]).astype(precision))
         biases.append(norm["bias"] - seen["mean"] * scale)
-    kernels.append(weights[f"conv{layers - 1}"].astype(dtype))
+    kernels.append(weights[f"conv{layers - 1}"].astype(precision))
     first, *rest = kernels
-    return PreparedDecoder(
+    decoder = PreparedDecoder(
         first[1:, 1:, 1:],
         tuple(prepare_kernel(kernel, 4 * 2**i) for i, kernel in enumerate(rest)),
-        (*biases, weights["bias"]),
+        tuple(bias.astype(jnp.float32) for bias in (*biases, weights["bias"])),
     )
+    return Prepared(decoder)
 
 
-def decode(
-    params: PyTree | PreparedDecoder,
-    code: Float[Array, "*batch d"],
-    *,
-    dtype: DTypeLike = jnp.float32,
-) -> Float[Array, "*batch x y z"]:
-    """**Logits** of the occupancy that a code stands for; occupied where positive.
-
-    The paper's output in (0, 1) is `jax.nn.sigmoid(logits)`. However many leading axes the codes
-    have, they are decoded by one call; on CPU it works through them a few at a time, so that its
-    memory does not grow with the population. A decoder that was prepared already has its precision.
-    """
-    decoder = params if isinstance(params, PreparedDecoder) else prepare_decoder(params, dtype)
-    return _over_leading_axes(partial(_decode, decoder), code, 1)
-
-
-def _decode(decoder: PreparedDecoder, code: Float[Array, "b d"]) -> Float[Array, "b x y z"]:
+def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y z"]:
+    """Logits of the occupancy that codes stand for."""
+    decoder: PreparedDecoder = prepared.shared
     code = code.astype(decoder.first.dtype)
     x = jnp.einsum("bd,xyzcd->bxyzc", code, decoder.first, preferred_element_type=jnp.float32)
     *biases, last = decoder.biases
@@ -214,10 +211,5 @@ def _decode(decoder: PreparedDecoder, code: Float[Array, "b d"]) -> Float[Array,
     return 2.0 * (x[..., 0].astype(jnp.float32) + last)
 
 
-def _over_leading_axes(function, x, core_axes):
-    """Apply a function of `[b, ...]` to any leading axes, on CPU a few examples at a time."""
-    batch, core = x.shape[: x.ndim - core_axes], x.shape[x.ndim - core_axes :]
-    flat = x.reshape(-1, *core)
-    chunked = partial(in_chunks, function, CODES_AT_A_TIME)
-    out = lax.platform_dependent(flat, cpu=chunked, default=function)
-    return out.reshape(*batch, *out.shape[1:])
+AUTOENCODER = ShapeModel("autoencoder", encode, decode, prepare, shapes)
+"""The paper's model."""

@@ -5,17 +5,45 @@ from typing import Literal
 
 from jaxshape.data.config import InputConfig
 
+Precision = Literal["float32", "bfloat16"]
+"""Of the matrix products of a decoder."""
+
 
 @dataclass(frozen=True)
 class Architecture:
-    """Sizes of the auto-encoder; the paper gives them in a figure that is lost."""
+    """Sizes of the auto-encoder; the paper gives them in a figure that is lost.
 
-    encoder: tuple[int, int, int, int] = (32, 64, 128, 256)
-    """Channels after each of the four strided convolutions."""
-    decoder: tuple[int, int, int] = (128, 64, 32)
-    """Channels after each transposed convolution but the last, which has one."""
+    The number of layers decides the resolution of its grids: 4 strided convolutions for 32^3, one
+    more for 64^3, one less for 16^3.
+
+    Attributes:
+        encoder: Channels after each strided convolution.
+        decoder: Channels after each transposed convolution but the last, which has one channel:
+            one entry fewer than `encoder`.
+        code: Numbers in a code (paper: 100).
+
+    Raises:
+        ValueError: The layers of encoder and decoder do not match, or a size is not positive.
+    """
+
+    encoder: tuple[int, ...] = (32, 64, 128, 256)
+    decoder: tuple[int, ...] = (128, 64, 32)
     code: int = 100
-    """Dimension of the code (paper: 100)."""
+
+    def __post_init__(self) -> None:
+        if not self.decoder or len(self.encoder) != len(self.decoder) + 1:
+            raise ValueError(
+                f"encoder has {len(self.encoder)} layers and decoder {len(self.decoder)} entries; "
+                "give at least one entry for the decoder and one more for the encoder, "
+                "such as (32, 64, 128, 256) and (128, 64, 32) for 32 voxels a side."
+            )
+        if min(*self.encoder, *self.decoder, self.code) < 1:
+            raise ValueError(f"{self}: every number of channels and the code are at least 1.")
+
+    @property
+    def resolution(self) -> int:
+        """Voxels along each axis of the grids."""
+        return 4 * 2 ** len(self.decoder)
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,11 @@ from safetensors.numpy import save_file
 from jaxshape.data.dataset import Dataset
 from jaxshape.data.inputs import draw_pair
 from jaxshape.files import atomic_path
-from jaxshape.model.autoencoder import AutoEncoder, architecture_of, encode, initialize
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model.autoencoder import AUTOENCODER, AutoEncoder, architecture_of, initialize
 from jaxshape.model.config import TrainConfig
-from jaxshape.model.weights import ShapePrior, fingerprint, flatten
+from jaxshape.model.shapes import ShapePrior, encode
+from jaxshape.model.weights import fingerprint, flatten
 
 
 class TrainState(NamedTuple):
@@ -86,6 +88,11 @@ def initial_state(config: TrainConfig, start: ShapePrior | None = None) -> Train
     """Random weights, or those of a shape prior to go on from."""
     if start is None:
         variables = initialize(jax.random.key(config.seed), config.architecture)
+    elif start.model != AUTOENCODER:
+        raise ValueError(
+            f"The weights to start from are of the kind {start.model.kind!r}; "
+            f"give those of an {AUTOENCODER.kind}."
+        )
     elif architecture_of(start.params) == config.architecture:
         variables = jax.tree.map(jnp.array, start.params)  # a copy: steps give theirs away
     else:
@@ -239,13 +246,19 @@ def finished_prior(
     """The shape prior of a finished run, with the statistics of the training set's codes."""
     variables = _read_checkpoint(Path(folder) / "checkpoint.safetensors", config).variables
     many = replace(config, batch=64, seed=config.seed + 1)
-    encode_batch = jax.jit(partial(encode, variables))
+    d = config.architecture.code
+    prior = ShapePrior(AUTOENCODER, variables, jnp.zeros(d), jnp.eye(d))
+    encode_batch = jax.jit(lambda prior, measured: encode(prior, Grids(measured, ~measured)))
     steps = -(-min(samples, len(dataset.names)) // many.batch)
-    codes = np.concatenate([encode_batch(batch_of(dataset, many, s)[0]) for s in range(steps)])
+    codes = np.concatenate(
+        [encode_batch(prior, batch_of(dataset, many, step)[0]) for step in range(steps)]
+    )
     covariance = np.cov(codes, rowvar=False)
     # Directions no code uses keep a little room to search in.
-    covariance += 1e-3 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
-    return ShapePrior(variables, jnp.asarray(codes.mean(0)), jnp.asarray(covariance, jnp.float32))
+    covariance += 1e-3 * np.trace(covariance) / d * np.eye(d)
+    return prior._replace(
+        code_mean=jnp.asarray(codes.mean(0)), code_covariance=jnp.asarray(covariance, jnp.float32)
+    )
 
 
 def save_checkpoint(folder: Path, state: TrainState, run: str) -> None:

@@ -1,62 +1,89 @@
-"""Trained auto-encoders on disk, as safetensors: no code is ever loaded. [host]"""
+"""Trained shape models on disk, as safetensors: no code is ever loaded. [host]"""
 
 import hashlib
 import json
 import os
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from jaxshape.files import atomic_path
-from jaxshape.model.autoencoder import architecture_of, initialize
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model.autoencoder import AUTOENCODER
+from jaxshape.model.pca import PCA
+from jaxshape.model.shapes import ShapeModel, ShapePrior, resolution_of
 
 FORMAT = "jaxshape-shape-prior-1"
 
+MODELS = {model.kind: model for model in (AUTOENCODER, PCA)}
+"""The kinds of shape models that come with the package."""
+
 
 class WeightsError(ValueError):
-    """A weights file is missing, damaged, or of another architecture."""
-
-
-class ShapePrior(NamedTuple):
-    """A trained auto-encoder and where in code space the training shapes lie."""
-
-    params: PyTree
-    """For `encode` and `decode`."""
-    code_mean: Float[Array, " d"]
-    code_covariance: Float[Array, "d d"]
-    """Of the codes of the training set: the scale on which a search takes its steps."""
+    """A weights file is missing, damaged, or of another model."""
 
 
 def save_prior(path: str | os.PathLike[str], prior: ShapePrior, card: dict[str, Any]) -> None:
-    """Write a shape prior in half precision, with its model card as metadata, atomically."""
-    tensors: dict[str, np.ndarray] = {
-        name: np.asarray(x, np.float16) for name, x in flatten(prior.params).items()
-    }
+    """Write a shape prior in half precision, with its model card as metadata, atomically.
+
+    Args:
+        path: The file to write, `.safetensors`.
+        prior: What to write; the parameters are a tree of dictionaries. The kind of its model is
+            written beside them.
+        card: The model card, anything that JSON can hold.
+    """
+    tensors = {name: _half(np.asarray(x)) for name, x in flatten(prior.params).items()}
     tensors["code_mean"] = np.asarray(prior.code_mean, np.float32)
     tensors["code_covariance"] = np.asarray(prior.code_covariance, np.float32)
+    metadata = {"format": FORMAT, "kind": prior.model.kind, "card": json.dumps(card)}
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, {"format": FORMAT, "card": json.dumps(card)})
+        save_file(tensors, temporary, metadata)
 
 
-def load_prior(path: str | os.PathLike[str] | None = None) -> ShapePrior:
+def _half(x: np.ndarray) -> np.ndarray:
+    """The array in half precision; in single precision where it would overflow."""
+    fits = np.abs(x).max(initial=0) < np.finfo(np.float16).max
+    return x.astype(np.float16 if fits else np.float32)
+
+
+def load_prior(
+    path: str | os.PathLike[str] | None = None, model: ShapeModel | None = None
+) -> ShapePrior:
     """Read a shape prior; without a path, the one for chairs that comes with the package.
 
-    Raises `WeightsError` when the file is missing, not in this format, damaged, or does not hold
-    the tensors, with the shapes, of an auto-encoder of the paper's form.
+    Args:
+        path: A file written by `save_prior` or `jaxshape train`.
+        model: Your own model, for weights of its kind. The package's models need not be named.
+
+    Raises:
+        WeightsError: The file is missing, damaged, not in this format, or of a kind of model that
+            is not known; or its arrays are not finite, or not those of its model.
     """
-    tensors, _ = _read(_path(path))
+    where = _path(path)
+    tensors, metadata = _read(where)
+    found = _model(metadata.get("kind", AUTOENCODER.kind), model, where)
     mean, covariance = tensors.pop("code_mean", None), tensors.pop("code_covariance", None)
     # Converted by NumPy: JAX would compile a program for each shape.
     params = unflatten({name: jnp.asarray(x.astype(np.float32)) for name, x in tensors.items()})
-    _check(params, mean, covariance, _path(path))
-    return ShapePrior(params, jnp.asarray(mean), jnp.asarray(covariance))
+    _check(found, params, mean, covariance, where)
+    return ShapePrior(found, params, jnp.asarray(mean), jnp.asarray(covariance))
+
+
+def _model(kind: str, given: ShapeModel | None, path: Path) -> ShapeModel:
+    known = MODELS if given is None else MODELS | {given.kind: given}
+    if kind not in known:
+        raise WeightsError(
+            f"{str(path)!r} holds weights of the kind {kind!r}; known are {', '.join(known)}. "
+            "Weights of your own model need it: load_prior(path, model)."
+        )
+    return known[kind]
 
 
 def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
@@ -115,23 +142,55 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     return tensors, metadata
 
 
-def _check(params: PyTree, mean, covariance, path: Path) -> None:
-    """Compare every shape with those of a network of the sizes the file seems to have."""
-    problem = None
-    try:
-        architecture = architecture_of(params)
-        expected = flatten(jax.eval_shape(lambda: initialize(jax.random.key(0), architecture)))
-        found = {name: x.shape for name, x in flatten(params).items()}
-        for name in sorted(expected.keys() | found.keys()):
-            shape = expected[name].shape if name in expected else "no such array"
-            if found.get(name) != shape:
-                problem = f"{name} is {found.get(name, 'missing')}, expected {shape}"
-                break
-        if mean is None or covariance is None:
-            problem = "the codes' mean or covariance is missing"
-        elif mean.shape != (architecture.code,) or covariance.shape != mean.shape * 2:
-            problem = f"statistics of {mean.shape} codes for codes of {architecture.code} numbers"
-    except (KeyError, TypeError, IndexError) as missing:
-        problem = f"no array {missing}"
+def _check(model: ShapeModel, params: PyTree, mean, covariance, path: Path) -> None:
+    """Raise `WeightsError` unless the arrays are finite and of the shapes of their model."""
+    problem = _wrong_shape(model, params) or _wrong_statistics(model, params, mean, covariance)
     if problem:
         raise WeightsError(f"{str(path)!r} holds weights of another architecture: {problem}.")
+    arrays = {**flatten(params), "code_mean": mean, "code_covariance": covariance}
+    for name, x in arrays.items():
+        if not np.isfinite(x).all():
+            raise WeightsError(f"{str(path)!r} is damaged: {name} holds NaN or infinity.")
+    if not is_covariance(covariance):
+        raise WeightsError(
+            f"{str(path)!r} is damaged: code_covariance is not symmetric and positive definite."
+        )
+
+
+def _wrong_shape(model: ShapeModel, params: PyTree) -> str | None:
+    """What is wrong with the shapes of the parameters, in a few words."""
+    if model.shapes is None:
+        return None
+    try:
+        expected = {name: x.shape for name, x in flatten(model.shapes(params)).items()}
+    except (KeyError, TypeError, IndexError, ValueError, AttributeError) as missing:
+        return f"no array {missing}"
+    found = {name: x.shape for name, x in flatten(params).items()}
+    for name in sorted(expected.keys() | found.keys()):
+        shape = expected.get(name, "no such array")
+        if found.get(name) != shape:
+            return f"{name} is {found.get(name, 'missing')}, expected {shape}"
+    return None
+
+
+def _wrong_statistics(model: ShapeModel, params: PyTree, mean, covariance) -> str | None:
+    """What is wrong with the shapes of the codes' statistics, in a few words."""
+    if mean is None or covariance is None:
+        return "the codes' mean or covariance is missing"
+    if mean.ndim != 1 or covariance.shape != mean.shape * 2:
+        return f"a covariance of shape {covariance.shape} for a mean code of shape {mean.shape}"
+    try:
+        nothing = jnp.zeros((1, *[resolution_of(model, params, len(mean))] * 3), bool)
+        code = jax.eval_shape(model.encode, params, Grids(nothing, nothing))
+    except Exception as problem:  # the model may be the user's, and raise anything
+        return f"{len(mean)} numbers are no code of this model ({problem})"
+    if code.shape[-1] != len(mean):
+        return f"statistics of codes of {len(mean)} numbers for codes of {code.shape[-1]} numbers"
+    return None
+
+
+def is_covariance(matrix: np.ndarray) -> bool:
+    """Whether a matrix is symmetric and positive definite, within the rounding of float32."""
+    values = np.linalg.eigvalsh(np.asarray(matrix, np.float64))
+    symmetric = np.allclose(matrix, matrix.T, rtol=1e-4, atol=1e-6 * abs(matrix).max())
+    return bool(symmetric and values[0] > 1e-9 * values[-1] > 0)

@@ -16,7 +16,7 @@ from jaxshape.data.dataset import hash_seed
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.results.metrics import bounds, iou, shape_scores
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import (

@@ -30,12 +30,19 @@ from jaxshape.data.sequences import (
 )
 from jaxshape.files import atomic_path
 from jaxshape.geometry import fusion
-from jaxshape.mapping.finding import Start, room
-from jaxshape.mapping.keyframes import Keyframe, Place, Shot, keyframe_of, place_of, prepare
-from jaxshape.mapping.placement import Placement
-from jaxshape.mapping.recording import FrameLog, Progress, trajectory
-from jaxshape.mapping.state import State, assemble
-from jaxshape.model.weights import ShapePrior
+from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
+from jaxshape.mapping.map.state import MapState, assemble
+from jaxshape.mapping.placement.finding import Start, room
+from jaxshape.mapping.placement.placing import Placement
+from jaxshape.mapping.tracking.keyframes import (
+    Keyframe,
+    Place,
+    PreparedFrame,
+    keyframe_of,
+    place_of,
+    prepare,
+)
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.results.output import Observation, write_shape
 
 STATE = "state.npz"
@@ -70,7 +77,7 @@ def write_progress(
     return result
 
 
-def observation_of(state: State, min_hits: int) -> Observation:
+def observation_of(state: MapState, min_hits: int) -> Observation:
     """What the keyframes of a map measured of the object."""
     every = max(1, len(state.keyframes) // FRAMES_TO_SHOW)
     shown = state.keyframes[::every][:FRAMES_TO_SHOW]
@@ -287,7 +294,7 @@ def _start(kept: dict[str, np.ndarray], about: dict[str, Any]) -> Start:
 
 def _state(
     kept, about, start: Start, place: Place, logs, sequence: Sequence, prior: ShapePrior
-) -> State:
+) -> MapState:
     indices = [log.index for log in logs if log.status == "keyframe"]
     keyframes: list[Keyframe] = []
     view = None
@@ -303,7 +310,7 @@ def _state(
         )
         information = jnp.asarray(kept["keyframes.information"][number])
         odometry = T_previous, information
-        keyframes.append(keyframe_of(Shot(view, masked), place, T, odometry, segmented))
+        keyframes.append(keyframe_of(PreparedFrame(view, masked), place, T, odometry, segmented))
     assert view is not None
     return assemble(
         prior,

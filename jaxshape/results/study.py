@@ -19,7 +19,7 @@ from rich.progress import Progress, TimeElapsedColumn
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
 from jaxshape.data.meshes import Skipped
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
 from jaxshape.results.figures import interval
 from jaxshape.results.journal import Journal

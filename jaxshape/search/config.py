@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from jaxshape.checks import at_least, one_of, positive, whole, within
+from jaxshape.model.config import Precision
 
-ObjectiveName = Literal["balanced", "paper"]
+ObjectiveName = Literal["balanced", "paper", "soft"]
 Space = Literal["whitened", "raw"]
-Precision = Literal["float32", "bfloat16"]
 
 
 def is_array(value: Any) -> bool:
@@ -21,7 +21,8 @@ class RefineConfig:
     """How a shape is searched for.
 
     Attributes:
-        objective: `paper` is Eq. 7 as printed; in `balanced` measured free space counts a third.
+        objective: `paper` is Eq. 7 as printed; in `balanced` measured free space counts a third; in
+            `soft` each voxel counts by how sure its measurement is.
         iterations: Steps of the search at most, 1 or more (paper: 350).
         population: Candidates per iteration of a population search, 3 or more (pycma's default for
             100 dimensions is 17).

@@ -2,127 +2,179 @@
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxshape.geometry.grid import RESOLUTION
-from jaxshape.model.autoencoder import decode, encode
-from jaxshape.model.weights import ShapePrior
+from jaxshape.geometry.evidence import Grid, Grids, binary
+from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
-from jaxshape.search.objective import BALANCED, PAPER, cross_entropy, target
+from jaxshape.search.objective import Penalty
 from jaxshape.search.refiner import Refiner, Trace
-from jaxshape.search.run import Penalty, refine
+from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual
+from jaxshape.search.run import Refined, refine
 from jaxshape.search.space import LatentSpace, raw, whitened
 
 
 class Reconstruction(NamedTuple):
-    """Shapes of a batch of objects, from first code to composed grid."""
+    """Shapes of a batch of objects, from first code to composed grid.
+
+    Attributes:
+        first_code: Code that the model proposes for what was measured `[object d]`.
+        code: Code that the search found `[object d]`.
+        completed_first: The first answer, G(lambda_0) > 0.5 `[object x y z]`.
+        logits: Decoded refined shape `[object x y z]`.
+        completed: The refined shape, G(lambda) > 0.5 `[object x y z]`.
+        composed: What was measured where something was, the refined shape elsewhere.
+        first_objective: Residual of the first code `[object]`, in nats per voxel.
+        objective: Residual of the refined code `[object]`, in nats per voxel.
+        trace: Trace of the search `[object iteration ...]`; None without a search.
+        path: Best code so far after each iteration `[object iteration d]`; None without a search.
+        iterations: Iterations that the search took `[object]`; None without a search.
+        stop: Why it ended `[object]`, a `StopReason`; None without a search.
+    """
 
     first_code: Float[Array, "object d"]
     code: Float[Array, "object d"]
     completed_first: Bool[Array, "object x y z"]
-    """The encoder's answer, G(lambda_0) > 0.5."""
     logits: Float[Array, "object x y z"]
-    """Of the refined shape."""
     completed: Bool[Array, "object x y z"]
-    """The refined shape, G(lambda) > 0.5."""
     composed: Bool[Array, "object x y z"]
-    """What was observed as it was measured, and the refined shape where nothing was."""
     first_objective: Float[Array, " object"]
     objective: Float[Array, " object"]
-    """Eq. 7, in nats per voxel, of the first and of the refined code."""
     trace: Trace | None
-    """Of the search, per object and iteration; None for the encoder alone."""
     path: Float[Array, "object iteration d"] | None
-    """The best code so far, after each iteration of the search."""
     iterations: Int[Array, " object"] | None
-    """How many iterations the search took."""
     stop: Int[Array, " object"] | None
-    """Why it ended, a `StopReason`."""
 
 
 def compose(
-    occupied: Bool[Array, "*batch x y z"],
-    occluded: Bool[Array, "*batch x y z"],
-    completed: Bool[Array, "*batch x y z"],
+    occupied: Grid, occluded: Grid, completed: Bool[Array, "*batch x y z"]
 ) -> Bool[Array, "*batch x y z"]:
-    """Keep what was observed as measured; fill what was occluded with the completed shape."""
-    return jnp.where(occluded, completed, occupied)
+    """Keep what was observed as measured; fill what was occluded with the completed shape.
+
+    Args:
+        occupied: F; soft grids are rounded.
+        occluded: M; soft grids are rounded.
+        completed: The decoded shape.
+    """
+    measured = binary(Grids(occupied, occluded))
+    return jnp.where(measured.occluded, completed, measured.occupied)
 
 
 def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner | None:
-    """The search of a method (`methods`); none for "encoder", which only proposes a code."""
+    """The search of a method, for the codes of a prior.
+
+    Args:
+        method: Its name (`build_refiner`), or "encoder" for no search: the first code stands.
+        prior: The shape prior.
+        config: Settings of the search.
+
+    Returns:
+        The refiner; None for "encoder".
+
+    Raises:
+        ValueError: There is no such method.
+    """
     if method == "encoder":
         return None
-    return build_refiner(method, len(prior.code_mean), config)
+    return build_refiner(method, prior.code_size, config)
 
 
 def search_space(prior: ShapePrior, config: RefineConfig) -> LatentSpace:
-    """The coordinates in which codes are searched."""
-    if config.space == "whitened":
-        return whitened(prior, config.bound)
-    return raw(len(prior.code_mean), config.bound)
+    """The coordinates in which codes are searched, as `config.space` says."""
+    return {"whitened": whitened, "raw": raw}[config.space](prior, config.bound)
 
 
-def unlikeliness(prior: ShapePrior, weight: float) -> Penalty:
+def code_penalty(prior: ShapePrior, weight: float) -> Penalty | None:
     """What a code costs for lying far from those of the training set.
 
     Half its squared Mahalanobis distance, its negative log-density up to a constant, in nats per
     voxel as the objective is: with weight 1 the sum of both is least at the most probable code.
+    None for weight 0.
     """
-    space, voxels = whitened(prior), RESOLUTION**3
+    if isinstance(weight, int | float) and weight == 0:
+        return None
+    space, voxels = whitened(prior), prior.resolution**3
     return lambda code: weight / voxels * 0.5 * jnp.sum(space.from_code(code) ** 2)
 
 
 def reconstruct(
-    keys: Key[Array, " object"],
+    keys: Key[Array, "*object"],
     prior: ShapePrior,
-    occupied: Bool[Array, "object x y z"],
-    occluded: Bool[Array, "object x y z"],
+    occupied: Grid,
+    occluded: Grid,
     refiner: Refiner | None,
     config: RefineConfig,
+    *,
+    residual: Residual | None = None,
     earlier: Float[Array, "object d"] | None = None,
+    data: Any = None,
 ) -> Reconstruction:
     """Rebuild a batch of objects from their measurement grids F and occlusion masks M.
 
-    `keys` holds one random key per object. `earlier` are codes found when less was measured: the
-    search starts from them where they explain the grids better than what the encoder proposes.
+    Args:
+        keys: One random key for each object, or one for all.
+        prior: The shape prior.
+        occupied: F of each object `[object x y z]`, binary or soft.
+        occluded: M of each object `[object x y z]`, binary or soft.
+        refiner: The search (`refiner_for`); None lets the first code stand.
+        config: Settings of the search.
+        residual: What is minimised, in place of the one that `config.objective` names.
+        earlier: Codes found when less was measured `[object d]`: the search starts from them where
+            they explain the grids better than the first code does.
+        data: Whatever your own model or residual needs of each object, as a pytree whose arrays
+            have a leading axis over objects: `grids.data` of `residual.target` and `encode`.
+
+    Raises:
+        ValueError: The grids have no batch axis, differ in shape, or are not of the prior's
+            resolution; or there are neither as many keys as objects nor one.
     """
-    first_code = encode(prior.params, occupied)
-    first_logits = decode(prior.params, first_code)
-    weights = BALANCED if config.objective == "balanced" else PAPER
-    targets = target(occupied, occluded, first_logits, weights)
-    first_objective = cross_entropy(first_logits, targets)
+    grids = Grids(occupied, occluded, data)
+    require_batch(grids)
+    residual = RESIDUALS[config.objective] if residual is None else residual
+    first_code = encode(prior, grids)
+    first_logits = decode(prior, first_code, grids)
+    targets = jax.vmap(residual.target)(grids, first_logits)
+    score = jax.vmap(residual.score)
+    first_objective = score(first_logits, targets)
     start, start_objective = first_code, first_objective
     if earlier is not None:
-        again = cross_entropy(decode(prior.params, earlier), targets)
+        again = score(decode(prior, earlier, grids), targets)
         start = jnp.where((again < first_objective)[:, None], earlier, first_code)
         start_objective = jnp.minimum(again, first_objective)
     if refiner is None:
         code, logits, objective, found = first_code, first_logits, first_objective, None
     else:
         # A prior adds to the objective, and a bound may move the first code.
-        is_first_loss = not config.prior_weight and config.bound is None
+        is_first_loss = config.prior_weight == 0 and config.bound is None
         found = refine(
             keys,
-            prior.params,
+            prior,
             start,
             targets,
             refiner,
             config.iterations,
+            residual=residual,
+            grids=grids,
             space=search_space(prior, config),
-            penalty=unlikeliness(prior, config.prior_weight),
+            penalty=code_penalty(prior, config.prior_weight),
             first_losses=start_objective if is_first_loss else None,
             target_loss=config.target,
             precision=config.precision,
         )
-        code, logits = found.code, found.logits
-        objective = cross_entropy(logits, targets)
+        code, logits, objective = found.code, found.logits, score(found.logits, targets)
+    return _reconstruction(grids, first_code, first_logits, first_objective, code, logits,
+                           objective, found)  # fmt: skip
+
+
+def _reconstruction(
+    grids, first_code, first_logits, first_objective, code, logits, objective, found: Refined | None
+) -> Reconstruction:
     completed = logits > 0
     return Reconstruction(
         first_code=first_code,
@@ -130,7 +182,7 @@ def reconstruct(
         completed_first=first_logits > 0,
         logits=logits,
         completed=completed,
-        composed=compose(occupied, occluded, completed),
+        composed=compose(grids.occupied, grids.occluded, completed),
         first_objective=first_objective,
         objective=objective,
         trace=found and found.trace,
@@ -141,12 +193,15 @@ def reconstruct(
 
 
 @cache
-def reconstruct_jit(refiner: Refiner | None, config: RefineConfig) -> Callable[..., Reconstruction]:
+def reconstruct_jit(
+    refiner: Refiner | None, config: RefineConfig, residual: Residual | None = None
+) -> Callable[..., Reconstruction]:
     """`reconstruct` with a fixed search, compiled once for each number of objects.
 
-    The same function for the same refiner and settings, so that who asks again need not compile.
+    The same function for the same refiner, settings and residual, so that who asks again need not
+    compile.
     """
-    return jax.jit(partial(reconstruct, refiner=refiner, config=config))
+    return jax.jit(partial(reconstruct, refiner=refiner, config=config, residual=residual))
 
 
 def fit_surface(
@@ -154,21 +209,38 @@ def fit_surface(
 ) -> Bool[Array, "object x y z"]:
     """The shapes of the space nearest to complete surfaces: the ceiling of any reconstruction.
 
-    Codes start where the encoder puts the complete surface and are fitted by Adam, in raw codes, to
+    Codes start where the model puts the complete surface and are fitted by Adam, in raw codes, to
     the balanced cross-entropy with all of it.
+
+    Args:
+        prior: The shape prior.
+        surface: Surface voxels of each object.
+        iterations: Steps of Adam.
     """
     config = RefineConfig(iterations=iterations, space="raw", tolerance=0.0)
-    nothing = jnp.zeros_like(surface)
+    grids = Grids(surface, jnp.zeros_like(surface))
+    require_batch(grids)
     found = refine(
-        jax.random.split(jax.random.key(0), len(surface)),  # Adam draws none
-        prior.params,
-        encode(prior.params, surface),
-        target(surface, nothing, jnp.zeros(surface.shape)),
-        build_refiner("gradient:adam", len(prior.code_mean), config),
+        jax.random.key(0),  # Adam draws no numbers
+        prior,
+        encode(prior, grids),
+        jax.vmap(BALANCED.target)(grids, jnp.zeros(surface.shape)),
+        build_refiner("gradient:adam", prior.code_size, config),
         iterations,
+        grids=grids,
         space=search_space(prior, config),
     )
     return found.logits > 0
+
+
+def require_batch(grids: Grids) -> None:
+    """Raise `ValueError` unless F and M are batches of grids of the same shape."""
+    shapes = jnp.shape(grids.occupied), jnp.shape(grids.occluded)
+    if len(shapes[0]) != 4 or shapes[0] != shapes[1]:
+        raise ValueError(
+            f"occupied has shape {shapes[0]} and occluded {shapes[1]}; give both as "
+            "[object, x, y, z], with an axis over objects: occupied[None] for a single one."
+        )
 
 
 def all_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> bool:

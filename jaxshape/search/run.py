@@ -1,6 +1,5 @@
 """The refinement loop: many objects, each with its population, in one compiled program."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,48 +8,52 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from jaxshape.model.autoencoder import decode, prepare_decoder
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model.shapes import Precision, ShapePrior, pick
 from jaxshape.search.batching import select
-from jaxshape.search.config import Precision
-from jaxshape.search.objective import Target, cross_entropy, objective
+from jaxshape.search.objective import Evaluation, Penalty, evaluation, prepare_one
 from jaxshape.search.refiner import Objective, Refiner, StopReason, Trace, finite_or_inf
-from jaxshape.search.space import LatentSpace
-
-# What a code costs besides its objective.
-Penalty = Callable[[Float[Array, " d"]], Float[Array, ""]]
+from jaxshape.search.residuals import BALANCED, Residual
+from jaxshape.search.space import LatentSpace, raw
 
 
 class Refined(NamedTuple):
-    """The outcome of a search for each object of a batch."""
+    """The outcome of a search for each object of a batch.
+
+    Attributes:
+        code: The best code that was evaluated `[object d]`.
+        logits: Its decoded shape `[object x y z]`, occupied where positive.
+        loss: Its objective `[object]`, in nats per voxel, with the penalty if there is one.
+        trace: What a reader plots `[object iteration ...]`; constant once the object's search has
+            stopped.
+        path: The best code so far, after each iteration `[object iteration d]`.
+        iterations: How many iterations the search took before it stopped `[object]`.
+        stop: Why it stopped `[object]`, a `StopReason`.
+        state: State of the refiner, one per object; a later search can start from it.
+    """
 
     code: Float[Array, "object d"]
-    """The best code that was evaluated."""
     logits: Float[Array, "object x y z"]
-    """Its decoded shape."""
     loss: Float[Array, " object"]
-    """Its objective, in nats per voxel, with the penalty if there is one."""
     trace: Trace
-    """Per object and iteration; constant once the object's search has stopped."""
     path: Float[Array, "object iteration d"]
-    """The best code so far, after each iteration."""
     iterations: Int[Array, " object"]
-    """How many the search took before it stopped."""
     stop: Int[Array, " object"]
-    """Why it stopped, a `StopReason`."""
     state: Any
-    """Of the refiner, one per object; a later search can start from it."""
 
 
 def refine(
-    keys: Key[Array, " object"],
-    params: PyTree,
+    keys: Key[Array, "*object"],
+    prior: ShapePrior,
     codes: Float[Array, "object d"],
-    targets: Target,
+    targets: PyTree,
     refiner: Refiner,
     iterations: int,
     *,
+    residual: Residual = BALANCED,
+    grids: Grids | None = None,
     space: LatentSpace | None = None,
-    penalty: Penalty = lambda code: jnp.zeros(()),
+    penalty: Penalty | None = None,
     first_losses: Float[Array, " object"] | None = None,
     target_loss: Float[Array, ""] | float | None = None,
     previous: Any = None,
@@ -58,39 +61,53 @@ def refine(
 ) -> Refined:
     """Search from each object's first code for one that explains its target better (section 3.3).
 
-    All candidates of all objects go through the decoder in one call per iteration. `keys` holds one
-    key per object: objects do not influence each other, and find the same in any company. An
-    object whose search has stopped is frozen and no longer decoded.
+    All candidates of all objects go through the decoder in one call per iteration. An object whose
+    search has stopped is frozen and no longer decoded.
 
-    `space` are the coordinates of the search, the codes themselves by default. `penalty` of a code
-    is added to its objective. `first_losses` are those of the first codes, where they are known.
-    `target_loss` is low enough to stop. With `previous`, the states of an earlier search in the
-    same space, this one goes on from these instead of from `codes`. `precision` is that of the
-    decoder's products during the search; `logits` and `loss` are float32 in any case.
+    Args:
+        keys: One random key for each object, or one for all, which is split. Objects do not
+            influence each other, and find the same in any company.
+        prior: The shape prior.
+        codes: First code of each object.
+        targets: Target of each object, `residual.target(grids, first_logits)`: a pytree whose
+            arrays have a leading axis over objects.
+        refiner: The search.
+        iterations: Steps of the search at most.
+        residual: The residual that the targets belong to.
+        grids: F and M of each object, for models whose decoder is given the measurement.
+        space: Coordinates of the search; the codes themselves by default.
+        penalty: `code -> ` nats per voxel, added to the objective.
+        first_losses: Objectives of the first codes, where they are known.
+        target_loss: Objective that is low enough to stop.
+        previous: States of an earlier search in the same space: this one goes on from these
+            instead of from `codes`.
+        precision: That of the decoder's products during the search; `logits` and `loss` are float32
+            in any case.
+
+    Raises:
+        ValueError: The arguments do not belong to the same number of objects, or `jax.vmap` is
+            asked to search with several networks at once.
     """
-    decoder = prepare_decoder(params)
-    searched = decoder if precision == "float32" else prepare_decoder(params, precision)
-    to_code = (lambda point: point) if space is None else space.to_code
-    from_code = (lambda code: code) if space is None else space.from_code
+    keys = keys_of(keys, codes, prior)
+    space = raw(prior) if space is None else space
+    exact = prepare_one(prior, grids, "float32")
+    searched = exact if precision == "float32" else prepare_one(prior, grids, precision)
+    how = _evaluation(prior, searched, residual, penalty, codes, targets)
 
-    def loss_of(target: Target) -> Objective:
-        def loss(point):
-            code = to_code(point)
-            return objective(searched, code, target) + penalty(code)
+    def loss_of(own: PyTree) -> Objective:
+        return lambda point: how.loss(how.shared, space.to_code(point), own)
 
-        return loss
-
-    def begin(key, code, target, loss, state):
-        point = from_code(code) if state is None else state.best.point
+    def begin(key, code, own, loss, state):
+        point = space.from_code(code) if state is None else state.best.point
         if loss is None or state is not None:
-            loss = loss_of(target)(point)
+            loss = loss_of(own)(point)
         if state is None or refiner.resume is None:
             return refiner.init(key, point, loss)
         return refiner.resume(key, state, loss)
 
-    def move(key, state, target, trace):
+    def move(key, state, own, trace):
         """One iteration of one object; nothing where its search has stopped."""
-        loss, running = loss_of(target), state.stop == StopReason.RUNNING
+        loss, running = loss_of(own), state.stop == StopReason.RUNNING
         awake = lambda point: loss(jnp.where(running, point, jnp.nan))  # noqa: E731
         moved = refiner.step(key, state, awake)
         state, trace = select(running, moved, (state, trace))
@@ -102,39 +119,81 @@ def refine(
 
         def move_all():
             step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
-            return jax.vmap(move)(step_keys, states, targets, traces)
+            return jax.vmap(move)(step_keys, states, own, traces)
 
         states, traces = lax.cond(jnp.any(running), move_all, lambda: (states, traces))
         return ((states, traces), steps + running), (traces, states.best.point)
 
+    own = searched.own, targets
     first_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
-    started = jax.vmap(begin)(first_keys, codes, targets, first_losses, previous)
+    started = jax.vmap(begin)(first_keys, codes, own, first_losses, previous)
     started = _stop_at(target_loss, started[0]), started[1]
     steps = jnp.zeros(len(codes), jnp.int32)
     ((states, _), steps), (traces, path) = lax.scan(
         iterate, (started, steps), jnp.arange(iterations)
     )
     over_iterations = partial(jnp.moveaxis, source=0, destination=1)
-
-    # Where the search stands at last was never evaluated: the mean of a population, or the point
-    # after the last gradient step. It may be the better one.
-    points = jnp.stack([states.best.point, states.mean], axis=1)
-    codes = jax.vmap(jax.vmap(to_code))(points)
-    logits = decode(decoder, codes)
-    losses = cross_entropy(logits, jax.tree.map(lambda x: x[:, None], targets))
-    losses = losses + jax.vmap(jax.vmap(penalty))(codes)
-    better = jnp.argmin(finite_or_inf(losses), axis=1)
-    code, logits, loss = (jax.vmap(lambda x, i: x[i])(x, better) for x in (codes, logits, losses))
+    final = how._replace(shared=(exact.shared, how.shared[1]))
+    code, logits, loss = _best(final, (exact.own, targets), states, space)
     return Refined(
         code=code,
         logits=logits,
         loss=loss,
         trace=jax.tree.map(over_iterations, traces),
-        path=jax.vmap(jax.vmap(to_code))(over_iterations(path)),
+        path=jax.vmap(jax.vmap(space.to_code))(over_iterations(path)),
         iterations=steps,
         stop=jnp.where(states.stop == StopReason.RUNNING, StopReason.BUDGET, states.stop),
         state=states,
     )
+
+
+def _evaluation(prior, prepared, residual, penalty, codes, targets) -> Evaluation:
+    """How codes are scored, from the first object of a batch."""
+    own = pick((prepared.own, targets), 0)
+    return evaluation(prior.model, prepared, residual, penalty, codes[0], own)
+
+
+def _best(
+    how: Evaluation, own: PyTree, states: Any, space: LatentSpace
+) -> tuple[Float[Array, "object d"], Float[Array, "object x y z"], Float[Array, " object"]]:
+    """Code, logits and objective of the best that each search has found.
+
+    Where a search stands at last was never evaluated: the mean of a population, or the point after
+    the last gradient step. It may be the better one.
+    """
+    points = jnp.stack([states.best.point, states.mean], axis=1)
+    codes = jax.vmap(jax.vmap(space.to_code))(points)
+    count, two, d = codes.shape
+    owner = jnp.repeat(jnp.arange(count), two)
+    logits, losses = how.shape(how.shared, codes.reshape(-1, d), own, owner)
+    better = jnp.argmin(finite_or_inf(losses).reshape(count, two), axis=1)
+    row = two * jnp.arange(count) + better
+    return codes.reshape(-1, d)[row], logits[row], losses[row]
+
+
+def keys_of(
+    keys: Key[Array, "*object"], codes: Float[Array, "object d"], prior: ShapePrior
+) -> Key[Array, " object"]:
+    """One key for each code, from one for each or one for all.
+
+    Raises:
+        ValueError: There are neither as many keys as codes nor one, or codes have another size.
+    """
+    if codes.ndim != 2 or codes.shape[-1] != prior.code_size:
+        raise ValueError(
+            f"codes have shape {codes.shape}; give [object, {prior.code_size}], one code for each "
+            "object of the batch (code[None] for one object)."
+        )
+    if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
+        keys = jax.random.wrap_key_data(keys)
+    if keys.ndim == 0:
+        return jax.random.split(keys, len(codes))
+    if keys.shape != (len(codes),):
+        raise ValueError(
+            f"There are keys of shape {keys.shape} for {len(codes)} objects; give one for each, "
+            "jax.random.split(key, objects), or a single one."
+        )
+    return keys
 
 
 def _stop_at(target_loss: Float[Array, ""] | float | None, states: Any) -> Any:

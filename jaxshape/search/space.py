@@ -9,23 +9,32 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 
 
 class LatentSpace(NamedTuple):
-    """An affine map from points to codes, with an optional box around its origin."""
+    """An affine map from points to codes, with an optional box around its origin.
 
-    mean: Float[Array, " d"]
-    root: Float[Array, "d d"]
-    """Lower triangular, with root @ root.T the covariance of the codes."""
+    Attributes:
+        mean: Code of the point 0 `[d]`.
+        root: Lower triangular matrix `[d d]`, with root @ root.T the covariance of the codes; None
+            where points are measured in codes.
+        bound: Points are folded into the box of this half side, in the units of points; None for no
+            box.
+    """
+
+    mean: Float[Array, "*d"]
+    root: Float[Array, "d d"] | None
     bound: Float[Array, ""] | float | None = None
-    """Points are folded into the box of this half side, in the units of u."""
 
     def to_code(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """The code of a point."""
-        step = jnp.dot(self.root, fold(point, self.bound), precision="highest")
+        step = fold(point, self.bound)
+        if self.root is not None:
+            step = jnp.dot(self.root, step, precision="highest")
         return self.mean + step
 
     def from_code(self, code: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -34,18 +43,47 @@ class LatentSpace(NamedTuple):
         Close to the bounds `to_code` moves it a little further in: at the very edge, where the
         fold turns back, a gradient could not leave again.
         """
-        point = jax.scipy.linalg.solve_triangular(self.root, code - self.mean, lower=True)
+        point = code - self.mean
+        if self.root is not None:
+            point = jax.scipy.linalg.solve_triangular(self.root, point, lower=True)
         return point if self.bound is None else jnp.clip(point, -self.bound, self.bound)
 
 
 def whitened(prior: ShapePrior, bound: float | None = None) -> LatentSpace:
-    """The space in which the training codes have zero mean and unit covariance."""
-    return LatentSpace(prior.code_mean, jnp.linalg.cholesky(prior.code_covariance), bound)
+    """The space in which the training codes have zero mean and unit covariance.
+
+    Args:
+        prior: The shape prior.
+        bound: Half side of the box around the mean, in standard deviations; None for no box.
+
+    Raises:
+        ValueError: The covariance of the codes is not positive semi-definite (told outside
+            `jax.jit` only; inside, every loss of the search is NaN).
+    """
+    root = _root(prior.code_covariance)
+    if not isinstance(root, Tracer) and not bool(jnp.all(jnp.isfinite(root))):
+        raise ValueError(
+            "code_covariance is not positive semi-definite, so there is no whitened space; "
+            "give the covariance of codes, or search in raw codes (space='raw')."
+        )
+    return LatentSpace(prior.code_mean, root, bound)
 
 
-def raw(dim: int, bound: float | None = None) -> LatentSpace:
-    """The codes themselves, as in the paper."""
-    return LatentSpace(jnp.zeros(dim), jnp.eye(dim), bound)
+def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The Cholesky factor; directions in which no code differs from the mean get a little room."""
+    root = jnp.linalg.cholesky(covariance)
+    room = 1e-6 * jnp.trace(covariance) * jnp.eye(len(covariance), dtype=covariance.dtype)
+    return jnp.where(jnp.all(jnp.isfinite(root)), root, jnp.linalg.cholesky(covariance + room))
+
+
+def raw(prior: ShapePrior, bound: float | None = None) -> LatentSpace:
+    """The codes themselves, as in the paper.
+
+    Args:
+        prior: The shape prior.
+        bound: Half side of the box around 0, in codes; None for no box.
+    """
+    return LatentSpace(jnp.zeros_like(prior.code_mean), None, bound)
 
 
 def fold(point: Float[Array, "*n"], bound: Float[Array, ""] | float | None) -> Float[Array, "*n"]:

@@ -128,9 +128,8 @@ def test_decoding_and_scoring_in_pytorch_is_ours(prior):
     rng = np.random.default_rng(0)
     codes = rng.normal(size=(2, 3, 10)).astype(np.float32)
     target = js.Target(*rng.random((2, 2, 32, 32, 32), np.float32))
-    losses = jax.jit(jax.vmap(jax.vmap(js.objective, (None, 0, None)), (None, 0, 0)))(
-        prior.params, codes, target
-    )
+    score = lambda codes, target: jax.vmap(js.objective(prior, target))(codes)  # noqa: E731
+    losses = jax.jit(jax.vmap(score))(codes, target)
     decoder = pytorch.from_jaxshape(prior.params).decoder
     for last, size in itertools.product((False, True), (None, 2)):
         score = pytorch.scorer(decoder, *target, channels_last=last, at_a_time=size)
@@ -143,7 +142,7 @@ def test_the_flax_decoder_is_ours(prior):
     rival = pytest.importorskip("benchmarks.rivals.evosax_flax")
     codes = jax.random.normal(jax.random.key(0), (2, 10))
     theirs = jax.jit(rival.decoder(prior.params))(codes)
-    np.testing.assert_allclose(theirs, jax.jit(js.decode)(prior.params, codes), atol=1e-4)
+    np.testing.assert_allclose(theirs, jax.jit(js.decode)(prior, codes), atol=1e-4)
 
 
 def test_pycma_searches_the_same_space_one_at_a_time_batched_and_together():

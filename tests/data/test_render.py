@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from jaxshape.data.render import SensorNoise
 from jaxshape.geometry import camera
 
 SIZE = 48
-CLEAN = SensorNoise(axial=0, lateral=0, quantization=1e-9, dropout=0, grazing=91)
+CLEAN = SensorNoise(axial=0.0, lateral=0.0, quantization=1e-9, dropout=0.0, grazing=91.0)
 VIEWS = jax.jit(camera.on_sphere, static_argnums=2)(
     jnp.array([0.0, 40.0, 200.0]), jnp.array([0.0, 35.0, -50.0]), 1.5
 )
@@ -111,7 +113,7 @@ def test_the_lens_just_holds_the_bounding_box_in_every_view():
 
 
 def test_axial_noise_grows_with_the_square_of_depth():
-    noise = CLEAN._replace(axial=1.4e-3)
+    noise = replace(CLEAN, axial=1.4e-3)
     for z in (1.0, 3.0):
         errors = noisy(plane(z), noise) - z
         np.testing.assert_allclose(errors.std(), 1.4e-3 * z**2, rtol=0.03)
@@ -122,33 +124,33 @@ def test_axial_noise_grows_with_the_square_of_depth():
 def test_depth_comes_in_steps_that_grow_with_its_square(z):
     step = 2.8e-3 * z**2
     depth = np.broadcast_to(np.linspace(z - 3 * step, z + 3 * step, 1000), (1, 3, 1000))
-    levels = np.unique(noisy(depth, CLEAN._replace(quantization=2.8e-3)))
+    levels = np.unique(noisy(depth, replace(CLEAN, quantization=2.8e-3)))
     assert 6 <= levels.size <= 8
     np.testing.assert_allclose(np.diff(levels), step, rtol=0.1)
 
 
 def test_dropout_loses_edges_alone():
-    measured = noisy(step_between(1.0, 1.5), CLEAN._replace(dropout=1.0))
+    measured = noisy(step_between(1.0, 1.5), replace(CLEAN, dropout=1.0))
     lost = np.zeros_like(measured, bool)
     lost[:, :, 19:21] = True
     np.testing.assert_array_equal(measured == 0, lost)
-    some = noisy(step_between(1.0, 1.5), CLEAN._replace(dropout=0.5), seed=1)
+    some = noisy(step_between(1.0, 1.5), replace(CLEAN, dropout=0.5), seed=1)
     assert 0.3 < (some[lost] == 0).mean() < 0.7
 
 
 def test_steps_too_small_to_be_edges_lose_nothing():
-    assert (noisy(step_between(1.0, 1.02), CLEAN._replace(dropout=1.0)) > 0).all()
+    assert (noisy(step_between(1.0, 1.02), replace(CLEAN, dropout=1.0)) > 0).all()
 
 
 def test_grazing_surfaces_are_lost_and_others_kept():
-    noise = CLEAN._replace(grazing=80)
+    noise = replace(CLEAN, grazing=80.0)
     assert not noisy(plane(1.0), noise, cosine=np.cos(np.deg2rad(81))).any()
     assert noisy(plane(1.0), noise, cosine=np.cos(np.deg2rad(79))).all()
 
 
 def test_jitter_across_the_image_moves_edges_and_nothing_else():
     depth = step_between(1.0, np.inf)
-    measured = noisy(depth, CLEAN._replace(lateral=1.0))
+    measured = noisy(depth, replace(CLEAN, lateral=1.0))
     moved = ~np.isclose(measured, depth, atol=1e-5)
     assert moved[:, :, 19:21].any()
     assert not moved[:, :, :19].any() and not moved[:, :, 21:].any()

@@ -118,3 +118,24 @@ def test_an_orbit_starts_in_front_and_turns_towards_plus_x():
     np.testing.assert_allclose((azimuth - 20 * np.arange(18) + 180) % 360, 180, atol=1e-3)
     np.testing.assert_allclose(elevation, 30, atol=1e-3)
     np.testing.assert_allclose(radius, 2.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_an_image_is_looked_up_at_the_pixel_that_holds_a_point(channels):
+    rng = np.random.default_rng(0)
+    image = rng.normal(size=(5, 7, *channels)).astype(np.float32)
+    pixels = np.float32(rng.uniform(-3, 10, (4, 200, 2)))
+    pixels[0, :4] = [[0, 0], [7, 0], [6.99, 4.99], [np.nan, 1]]
+    found = np.asarray(camera.look_up(jnp.asarray(image), jnp.asarray(pixels)))
+    assert found.shape == (4, 200, *channels)
+    for (u, v), value in zip(pixels.reshape(-1, 2), found.reshape(-1, *channels), strict=True):
+        inside = 0 <= u < 7 and 0 <= v < 5
+        np.testing.assert_array_equal(value, image[int(v), int(u)] if inside else 0)
+    assert (found != 0).any() and (found == 0).any()
+
+
+def test_a_camera_matrix_gives_the_camera_that_projects_like_it():
+    K = np.array([[520.0, 0, 320.5], [0, 510, 240.25], [0, 0, 1]])
+    p = np.array([0.3, -0.2, 1.7])
+    pixels, _ = camera.project(camera.intrinsics_of(K), jnp.float32(p))
+    np.testing.assert_allclose(pixels, (K @ p / p[2])[:2], rtol=1e-6)

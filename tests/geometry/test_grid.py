@@ -57,3 +57,15 @@ def test_one_scale_for_all_axes_fills_the_longest_and_centres_the_others(batch):
     np.testing.assert_allclose(sides.max(axis=-1), 12, atol=1e-4)
     given = np.asarray(upper - lower)
     np.testing.assert_allclose(sides, 12 * given / given.max(axis=-1, keepdims=True), atol=1e-3)
+
+
+def test_a_point_lies_in_the_voxel_of_its_flat_index():
+    rng = np.random.default_rng(0)
+    voxels = np.float32(rng.uniform(-1, 6, (300, 3)))
+    voxels[:4] = [[0, 0, 0], [5, 0, 0], [4.99, 4.99, 4.99], [np.nan, 1, 1]]
+    index = np.asarray(grid.flat_index(jnp.asarray(voxels.T), 5))
+    for point, i in zip(voxels, index, strict=True):
+        inside = bool(np.all((point >= 0) & (point < 5)))
+        assert i == (np.ravel_multi_index(tuple(point.astype(int)), (5, 5, 5)) if inside else 125)
+    x, y, z = jnp.arange(5)[:, None, None] + 0.5, jnp.arange(5)[:, None] + 0.5, jnp.arange(5) + 0.5
+    np.testing.assert_array_equal(grid.flat_index((x, y, z), 5).ravel(), np.arange(125))

@@ -11,9 +11,9 @@ from PIL import Image
 from jaxshape import files
 from jaxshape.data.boxes import read_box
 from jaxshape.data.sequences import SequenceError, open_sequence, read_trajectory
-from jaxshape.mapping.finding import find_start
-from jaxshape.mapping.recording import follow, trajectory
-from jaxshape.mapping.segmentation import Prompt
+from jaxshape.mapping.map.recording import follow, trajectory
+from jaxshape.mapping.placement.finding import find_start
+from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.results import progress as module
 from jaxshape.results.progress import (
     STATE,

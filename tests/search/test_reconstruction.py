@@ -14,13 +14,13 @@ from jaxshape.search import reconstruction
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.objective import PAPER, cross_entropy, target
 from jaxshape.search.reconstruction import (
+    code_penalty,
     compose,
     fit_surface,
     reconstruct_jit,
     refiner_for,
     require_measured,
     search_space,
-    unlikeliness,
 )
 from jaxshape.search.refiner import StopReason
 
@@ -169,16 +169,16 @@ def test_a_bound_holds_every_coordinate(skewed, space):
 def test_the_prior_pulls_codes_to_their_mean(skewed):
     """Its weight counts nats: half the squared Mahalanobis distance, once per grid."""
     code = MEAN + ROOT @ jnp.linspace(-1, 1, 10)
-    penalty = unlikeliness(skewed, 2.0)(code)
+    penalty = code_penalty(skewed, 2.0)(code)
     np.testing.assert_allclose(penalty, 2 * 0.5 * mahalanobis(code) / 32**3, rtol=1e-4)
-    assert unlikeliness(skewed, 2.0)(MEAN) == 0
+    assert code_penalty(skewed, 2.0)(MEAN) == 0
 
     distances = []
     for weight in (0.0, 1e7):
         found = searching(skewed, "gradient", iterations=8, prior_weight=weight, step_size=3e-3)
         distances.append(mahalanobis(found.code))
         if weight:  # the loss of the search is the sum of both
-            total = found.objective + jax.vmap(unlikeliness(skewed, weight))(found.code)
+            total = found.objective + jax.vmap(code_penalty(skewed, weight))(found.code)
             assert np.all(total <= found.trace.best_loss[:, -1] * 1.0001)
     assert np.all(distances[0] > 1) and np.all(distances[1] < 1e-3)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.space import fold, raw, whitened
 
 BOUND = 2.0

@@ -1,0 +1,154 @@
+"""The pose of a new frame in a map (paper, section 3.4), and whether the camera has moved. [host]
+
+localize    registration from the expected pose; where that fails, from many others
+has_moved   whether a frame shows the object from elsewhere than the last keyframe
+"""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.map.state import MapState, no_surface
+from jaxshape.mapping.tracking import icp, registration, surfels
+from jaxshape.mapping.tracking.icp import Alignment
+from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame, object_pixels, view_again
+from jaxshape.mapping.tracking.registration import displacement, doubt
+from jaxshape.mapping.tracking.surfels import Surface
+from jaxshape.mapping.tracking.views import DepthView
+
+_JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess of the motion
+
+
+def localize(
+    state: MapState, prepared: PreparedFrame, config: TrackingConfig
+) -> tuple[Alignment, str | None]:
+    """The pose of a frame in the world, and why it should not be believed.
+
+    Args:
+        state: The map; the frame is expected where the motion of the last frames goes on.
+        prepared: The frame.
+        config: What the frame is aligned with, and when its pose is believed.
+
+    Returns:
+        The alignment of the frame with the map; and a few words against it, None where there are
+        none.
+    """
+    T_expected = (state.T_world_camera @ state.T_before_last).normalize()
+    pixels = _tracked_pixels(state, prepared, T_expected, config)
+    surface = state.surface if config.against == "map" else no_surface(state.place.lattice)
+    T_keyframe = state.keyframes[-1].T_world_camera
+    found = _register(prepared.view, pixels, state.view, T_keyframe, surface, T_expected)
+    reason = doubt(found, T_expected, config)
+    is_sure = found.converged and found.inlier_fraction >= config.sure_inliers
+    if reason is None and is_sure:
+        return found, None
+    best, is_believed = _relocalized(state, prepared.view, pixels, surface, found, config)
+    if is_believed:
+        return best, None
+    return best, reason or doubt(best, T_expected, config)
+
+
+def _tracked_pixels(
+    state: MapState, prepared: PreparedFrame, T_expected: jaxlie.SE3, config: TrackingConfig
+) -> Bool[Array, "h w"]:
+    """Pixels that are aligned: all, or those of the object."""
+    if config.on == "scene":
+        return jnp.ones_like(prepared.masked)
+    return object_pixels(prepared, state.place, T_expected)
+
+
+def _relocalized(
+    state: MapState,
+    view: DepthView,
+    pixels: Bool[Array, "h w"],
+    surface: Surface,
+    found: Alignment,
+    config: TrackingConfig,
+) -> tuple[Alignment, bool]:
+    """The best alignment from many guesses about the object, and whether it is believed.
+
+    Against the last keyframe, then against others; however far the camera jumped.
+    """
+    center = jnp.float32(state.place.box.T_world_object[:3, 3])
+    best = found
+    for keyframe in _worth_trying(state.keyframes):
+        reference = view_again(keyframe.depth, keyframe.intrinsics)
+        is_last = keyframe is state.keyframes[-1]
+        T_near = state.T_world_camera if is_last else keyframe.T_world_camera
+        again = _register_from(
+            view, pixels, reference, keyframe.T_world_camera, surface, T_near, center
+        )
+        if registration.score(again) > registration.score(best):
+            best = again
+        if doubt(best, None, config) is None:
+            return best, True
+    return best, False
+
+
+def _worth_trying(keyframes: tuple[Keyframe, ...], count: int = 4) -> list[Keyframe]:
+    """The last keyframe, then some from all over the map."""
+    others = np.unique(np.linspace(0, len(keyframes) - 2, count).astype(int))
+    return [keyframes[-1], *(keyframes[i] for i in others if 0 <= i < len(keyframes) - 1)]
+
+
+@jax.jit
+def _register(view, pixels, reference, T_reference, surface, T_expected):
+    match = icp.match_all(icp.match_view(reference, T_reference), surfels.match_surface(surface))
+    return registration.register(view, pixels, match, T_expected)
+
+
+@jax.jit
+def _register_from(view, pixels, reference, T_reference, surface, T_near, center):
+    match = icp.match_all(icp.match_view(reference, T_reference), surfels.match_surface(surface))
+    return registration.register_from(view, pixels, match, registration.guesses(T_near, center))
+
+
+# Motion ------------------------------------------------------------------------------------------
+
+
+def moved_to(state: MapState, T_world_camera: jaxlie.SE3) -> MapState:
+    """The state after a frame was found at a pose: the next one is expected further on.
+
+    Args:
+        state: The map before the frame.
+        T_world_camera: The pose of the frame.
+
+    Returns:
+        The same map, with the pose and the motion to it. After a jump, as over missing frames, no
+        motion is expected.
+    """
+    motion = (state.T_world_camera.inverse() @ T_world_camera).normalize()
+    distance, angle = displacement(motion, jaxlie.SE3.identity())
+    goes_on = distance < _JUMP[0] and angle < _JUMP[1]
+    return state._replace(
+        T_world_camera=T_world_camera,
+        T_before_last=motion if goes_on else jaxlie.SE3.identity(),
+    )
+
+
+def has_moved(state: MapState, T_world_camera: jaxlie.SE3, config: MappingConfig) -> bool:
+    """Whether a frame shows the object from elsewhere than the last keyframe.
+
+    Args:
+        state: The map.
+        T_world_camera: The pose of the frame.
+        config: How far a camera moves between keyframes.
+
+    Returns:
+        True where it turned, as it is or as seen from the object, or moved further than that.
+    """
+    T_last = state.keyframes[-1].T_world_camera
+    distance, turned = displacement(T_last, T_world_camera)
+    center = state.place.box.T_world_object[:3, 3]
+    angle = _angle_about(center, T_last, T_world_camera)
+    return max(angle, turned) > config.keyframe_angle or distance > config.keyframe_distance
+
+
+def _angle_about(center: np.ndarray, T_a: jaxlie.SE3, T_b: jaxlie.SE3) -> float:
+    """Degrees between two cameras as seen from a point."""
+    a, b = (np.asarray(T.translation(), np.float64) - center for T in (T_a, T_b))
+    cosine = a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

@@ -1,0 +1,188 @@
+"""A recording from its first frame to its last. [host]
+
+    start = find_start(sequence, prior, Prompt(click=(320, 240)))
+    for progress in follow(sequence, start, mapper, prior):
+        ...                              # after every frame; write, draw, or stop and go on later
+    state, reconstruction = mapper.finish(progress.state)
+
+Whatever is wrong with one frame, a damaged file or a pose in doubt, costs that frame alone and is
+written down in its `FrameLog`.
+"""
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxshape.data.boxes import Box, points_in_box
+from jaxshape.data.sequences import Frame, Sequence, SequenceError
+from jaxshape.geometry import camera
+from jaxshape.mapping.map.mapper import Mapper, Step
+from jaxshape.mapping.map.state import MapState
+from jaxshape.mapping.placement.finding import Start, placed_again, room
+from jaxshape.mapping.segmentation.segment import segment_inside
+from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.search.reconstruction import Reconstruction
+
+PLACE_AGAIN = (2, 3, 5, 8, 13)
+"""Numbers of keyframes after which the object is placed anew."""
+
+
+class FrameLog(NamedTuple):
+    """What became of one frame."""
+
+    index: int
+    name: str
+    status: str
+    """keyframe, tracked, lost or unreadable."""
+    reason: str
+    keyframe: int
+    """The keyframe, counted from 0, that the pose is relative to."""
+    T_keyframe_camera: Float[np.ndarray, "4 4"] | None
+    """None where the frame has no pose."""
+    figures: dict[str, float]
+    """Inlier fraction, overlap, rmse in metres and conditioning of the alignment, and seconds."""
+
+
+class Progress(NamedTuple):
+    """A map and what became of the frames so far."""
+
+    state: MapState
+    start: Start
+    logs: tuple[FrameLog, ...]
+    shape: Reconstruction | None = None
+    """As last refined, a batch of one; None after an earlier run's progress was read."""
+
+
+def follow(
+    sequence: Sequence,
+    start: Start,
+    mapper: Mapper,
+    prior: ShapePrior,
+    *,
+    chosen: Iterable[int] | None = None,
+    use_poses: bool = False,
+    earlier: Progress | None = None,
+) -> Iterator[Progress]:
+    """Track and map the chosen frames, by default all from the start's on; yields after each.
+
+    With `use_poses` the given poses are taken, and only frames without one are tracked. `earlier`
+    is the progress of a run that was cut short, after whose last frame this one goes on.
+    """
+    chosen = range(start.index, len(sequence)) if chosen is None else chosen
+    progress = earlier or _begin(sequence, start, mapper, use_poses)
+    if earlier is None:
+        yield progress
+    done = progress.logs[-1].index
+    for index in (i for i in chosen if i > done):
+        progress = _next(sequence, index, mapper, progress, use_poses)
+        if progress.logs[-1].status == "keyframe":
+            progress = _placed_anew(progress, mapper, prior)
+        yield progress
+
+
+def _begin(sequence: Sequence, start: Start, mapper: Mapper, use_poses: bool) -> Progress:
+    frame = sequence[start.index]
+    prepared = prepare(frame, sequence.intrinsics, start.masked)
+    state, step = mapper.init(
+        prepared,
+        start.box,
+        as_pose(start.T_world_camera),
+        room=room(start),
+        poses_are_given=use_poses,
+    )
+    log = FrameLog(start.index, frame.name, "keyframe", "", 0, np.eye(4), _figures(step))
+    return Progress(state, start, (log,), step.shape)
+
+
+def _next(
+    sequence: Sequence, index: int, mapper: Mapper, progress: Progress, use_poses: bool
+) -> Progress:
+    state, logs = progress.state, progress.logs
+    last = len(state.keyframes) - 1
+    try:
+        frame = sequence[index]
+    except SequenceError as problem:
+        name = sequence.names[index]
+        log = FrameLog(index, name, "unreadable", str(problem), last, None, {})
+        return progress._replace(logs=(*logs, log))
+    given = frame.T_world_camera if use_poses else None
+    prepared = prepare(frame, sequence.intrinsics)
+    # A mask, or a box that was given, says what is the object; one that was found is not sure.
+    is_estimated = progress.start.T_level_world is not None and frame.mask is None
+    cut = partial(_cut, frame, sequence, state.keyframes) if is_estimated else None
+    state, step = mapper.step(state, prepared, None if given is None else as_pose(given), cut)
+    relative = None
+    if step.T_world_camera is not None:
+        keyframe = state.keyframes[-1].T_world_camera
+        relative = np.asarray((keyframe.inverse() @ step.T_world_camera).as_matrix(), np.float64)
+    log = FrameLog(
+        index=index,
+        name=frame.name,
+        status=step.status,
+        reason=step.reason,
+        keyframe=len(state.keyframes) - 1,
+        T_keyframe_camera=relative,
+        figures=_figures(step),
+    )
+    return Progress(state, progress.start, (*logs, log), step.shape or progress.shape)
+
+
+def _cut(
+    frame: Frame, sequence: Sequence, keyframes: tuple[Keyframe, ...], box: Box, T: jaxlie.SE3
+) -> Bool[Array, "_ _"]:
+    """The clusters of a frame that lie mostly in the object's box and are nothing seen before."""
+    others = np.concatenate([_others(one, box) for one in keyframes[:1] + keyframes[1:][-8:]])
+    T_world_camera = np.asarray(T.as_matrix(), np.float64)
+    found = segment_inside(frame.depth, sequence.intrinsics, box, T_world_camera, others)
+    return resized(found, keyframes[0].depth.shape)
+
+
+def _others(keyframe: Keyframe, box: Box) -> Float[np.ndarray, "n 3"]:
+    """World points in the object's box that a keyframe took for something else."""
+    points = np.asarray(_world_points(keyframe), np.float64)[::3, ::3]
+    other = (~np.asarray(keyframe.masked) & (np.asarray(keyframe.depth) > 0))[::3, ::3]
+    points = points[other]
+    return points[points_in_box(points, box)]
+
+
+@jax.jit
+def _world_points(keyframe: Keyframe) -> Float[Array, "h w 3"]:
+    known = jnp.where(jnp.isfinite(keyframe.depth), keyframe.depth, 0)
+    points = camera.unproject(keyframe.intrinsics, known)
+    return camera.transform(keyframe.T_world_camera, points)
+
+
+def _figures(step: Step) -> dict[str, float]:
+    figures = {f"seconds_{part}": seconds for part, seconds in step.seconds.items()}
+    if step.alignment is not None:
+        for name in ("inlier_fraction", "overlap", "rmse", "conditioning"):
+            figures[name] = float(getattr(step.alignment, name))
+    return figures
+
+
+def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progress:
+    """The progress with the object's box estimated again, where that is due."""
+    is_estimated = progress.start.T_level_world is not None
+    if not is_estimated or len(progress.state.keyframes) not in PLACE_AGAIN:
+        return progress
+    start = placed_again(progress.start, prior, progress.state.keyframes)
+    state, shape = mapper.moved(progress.state, start.box, room=room(start))
+    return progress._replace(state=state, start=start, shape=shape)
+
+
+def trajectory(progress: Progress) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """T_world_camera of every frame that has a pose, from where its keyframe is now."""
+    poses = {}
+    for log in progress.logs:
+        if log.T_keyframe_camera is not None:
+            keyframe = progress.state.keyframes[log.keyframe].T_world_camera
+            T = np.asarray(keyframe.as_matrix(), np.float64)
+            poses[log.index] = T @ log.T_keyframe_camera
+    return poses

@@ -1,0 +1,208 @@
+"""The state of a map: keyframes, what they add up to, and the shape that explains it. [host]"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxshape.geometry import fusion
+from jaxshape.geometry.fusion import Measurement
+from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.mapping.map.realign import Odometry, realign
+from jaxshape.mapping.tracking import surfels
+from jaxshape.mapping.tracking.icp import Alignment
+from jaxshape.mapping.tracking.keyframes import Keyframe, Place
+from jaxshape.mapping.tracking.surfels import Lattice, Sums, Surface
+from jaxshape.mapping.tracking.views import DepthView
+from jaxshape.model.shapes import ShapePrior
+
+_LEAST_CAPACITY = 8  # keyframes for which realigning is compiled, even where there are fewer
+
+
+class MapState(NamedTuple):
+    """All that the next step needs."""
+
+    keyframes: tuple[Keyframe, ...]
+    place: Place
+    measurement: Measurement
+    sums: Sums
+    code: Float[Array, " d"]
+    """Of the shape as last refined; the mean code before anything was measured."""
+    logits: Float[Array, "x y z"]
+    """Its decoded shape; -inf before anything was measured."""
+    surface: Surface
+    """What frames are tracked against."""
+    view: DepthView
+    """Of the last keyframe."""
+    T_world_camera: jaxlie.SE3
+    """Of the last frame that was tracked."""
+    T_before_last: jaxlie.SE3
+    """How the camera moved to it from the frame before."""
+    poses_are_given: bool
+
+
+def assemble(
+    prior: ShapePrior,
+    place: Place,
+    keyframes: tuple[Keyframe, ...],
+    view: DepthView,
+    *,
+    code: Float[Array, " d"] | None = None,
+    logits: Float[Array, "x y z"] | None = None,
+    T_world_camera: jaxlie.SE3 | None = None,
+    T_before_last: jaxlie.SE3 | None = None,
+    poses_are_given: bool = False,
+) -> MapState:
+    """The state of a map with these keyframes, of whose last one `view` is.
+
+    `code` and `logits` are those of the shape found so far, `T_world_camera` the pose of the last
+    frame that was tracked and `T_before_last` the motion before it, where there was one since.
+    """
+    state = MapState(
+        keyframes=keyframes,
+        place=place,
+        measurement=fusion.nothing_measured(),
+        sums=surfels.no_sums(),
+        code=prior.code_mean if code is None else code,
+        logits=jnp.full((RESOLUTION,) * 3, -jnp.inf) if logits is None else logits,
+        surface=no_surface(place.lattice),
+        view=view,
+        T_world_camera=T_world_camera or keyframes[-1].T_world_camera,
+        T_before_last=T_before_last or jaxlie.SE3.identity(),
+        poses_are_given=poses_are_given,
+    )
+    return with_surface(fused_anew(state))
+
+
+def fused_anew(state: MapState) -> MapState:
+    """The state with F, M and the measured surface made from all keyframes where they are now."""
+    state = state._replace(measurement=fusion.nothing_measured(), sums=surfels.no_sums())
+    for keyframe in state.keyframes:
+        state = added(state, keyframe)
+    return state
+
+
+def added(state: MapState, keyframe: Keyframe) -> MapState:
+    """The state with one more keyframe fused into F, M and the measured surface."""
+    T_object_world = jaxlie.SE3.from_matrix(
+        jnp.float32(np.linalg.inv(state.place.box.T_world_object))
+    )
+    measurement, sums = _add(
+        state.measurement, state.sums, keyframe, T_object_world, state.place.frame,
+        state.place.lattice,
+    )  # fmt: skip
+    return state._replace(measurement=measurement, sums=sums)
+
+
+@jax.jit
+def _add(measurement, sums, keyframe: Keyframe, T_object_world, frame, lattice):
+    T_object_camera = T_object_world @ keyframe.T_world_camera
+    new = fusion.measure(
+        keyframe.depth, keyframe.segmented, keyframe.intrinsics, T_object_camera, frame
+    )
+    R = keyframe.T_world_camera.rotation().as_matrix()
+    points = keyframe.cloud.points @ R.T + keyframe.T_world_camera.translation()
+    more = surfels.add_up(lattice, points, keyframe.cloud.normals @ R.T, keyframe.cloud.deviation)
+    return fusion.merge(measurement, new), jax.tree.map(jnp.add, sums, more)
+
+
+@partial(jax.jit, static_argnums=1)
+def grids_of(measurement: Measurement, min_hits: int):
+    """F and M."""
+    return fusion.occupied(measurement, min_hits), fusion.occluded(measurement, min_hits)
+
+
+def odometry_of(
+    state: MapState, T: jaxlie.SE3, alignment: Alignment | None
+) -> tuple[jaxlie.SE3, Float[Array, "6 6"]]:
+    """The new keyframe relative to the last, and the information of that."""
+    T_last = state.keyframes[-1].T_world_camera
+    information = jnp.zeros((6, 6))
+    if alignment is not None:
+        to_world = T_last.adjoint()
+        information = to_world.T @ alignment.information @ to_world
+    return (T_last.inverse() @ T).normalize(), information
+
+
+def realigned(state: MapState) -> MapState:
+    """The state with all keyframes moved to where they agree with each other and with the shape.
+
+    Args:
+        state: A map of at least one keyframe, with its shape refined.
+
+    Returns:
+        The map with new poses, fused anew; the last tracked frame moves with the last keyframe.
+    """
+    T = realigned_poses(state)
+    moved = (T[-1] @ state.keyframes[-1].T_world_camera.inverse()).normalize()
+    keyframes = tuple(
+        one._replace(T_world_camera=pose) for one, pose in zip(state.keyframes, T, strict=True)
+    )
+    state = state._replace(
+        keyframes=keyframes, T_world_camera=(moved @ state.T_world_camera).normalize()
+    )
+    return with_surface(fused_anew(state))
+
+
+def realigned_poses(state: MapState) -> list[jaxlie.SE3]:
+    """Where the keyframes agree best with each other and with the refined shape."""
+    count = len(state.keyframes)
+    capacity = capacity_for(count)
+    filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - count)]
+    clouds, T, T_previous, information = jax.tree.map(
+        lambda *x: jnp.stack(x),
+        *[(k.cloud, k.T_world_camera, k.T_previous_keyframe, k.information) for k in filled],
+    )
+    is_keyframe = np.arange(capacity) < count
+    information = jnp.where(jnp.asarray(is_keyframe)[:, None, None], information, 0)
+    center = jnp.float32(state.place.box.T_world_object[:3, 3])
+    T = _realign(
+        clouds, T, is_keyframe, state.place.lattice, jax.nn.sigmoid(state.logits),
+        Odometry(T_previous, information), np.arange(capacity) == 0, center,
+    )  # fmt: skip
+    return [jaxlie.SE3(T.wxyz_xyz[i]) for i in range(count)]
+
+
+def capacity_for(count: int) -> int:
+    """The number of keyframes for which realigning is compiled: the next power of two.
+
+    Args:
+        count: How many there are, 1 or more.
+
+    Returns:
+        8, 16, 32, ...: with each twice as large as the one before, a map that grows is compiled
+        for a few times only.
+    """
+    return max(_LEAST_CAPACITY, 1 << (count - 1).bit_length())
+
+
+@jax.jit
+def _realign(clouds, T, is_keyframe, lattice, probability, odometry, is_fixed, center):
+    # About the object, so that rotations have short arms and positions keep their digits.
+    near = Lattice(lattice.linear, lattice.offset + lattice.linear @ center)
+    to_near = jaxlie.SE3.from_translation(-center)
+    predicted = surfels.predicted_surface(near, probability)
+    T = realign(clouds, to_near @ T, is_keyframe, near, predicted, odometry, is_fixed)
+    return to_near.inverse() @ T
+
+
+def with_surface(state: MapState) -> MapState:
+    """The state with the surface that frames are tracked against: measured, else predicted."""
+    surface = _composed_surface(state.place.lattice, state.sums, jax.nn.sigmoid(state.logits))
+    return state._replace(surface=surface)
+
+
+@jax.jit
+def _composed_surface(lattice, sums, probability) -> Surface:
+    measured = surfels.measured_surface(lattice, sums)
+    return surfels.composed_surface(measured, surfels.predicted_surface(lattice, probability))
+
+
+@jax.jit
+def no_surface(lattice: Lattice) -> Surface:
+    """The surface of nothing."""
+    return surfels.measured_surface(lattice, surfels.no_sums())

@@ -1,0 +1,261 @@
+"""The object in the first frame that shows it: cut out, and its frame found. [host]
+
+find_start     which frame, which pixels, and where the object stands in the world
+placed_again   the same box, estimated from all keyframes so far
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxshape.data.boxes import Box
+from jaxshape.data.sequences import Frame, Sequence, SequenceError
+from jaxshape.mapping.placement import placing
+from jaxshape.mapping.placement.placing import Placement
+from jaxshape.mapping.placement.rays import pooled, sample_rays
+from jaxshape.mapping.segmentation.planes import Floor, camera_points, dominant_planes, floor_plane
+from jaxshape.mapping.segmentation.segment import Prompt, Segmentation, segment
+from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
+from jaxshape.model.shapes import ShapePrior
+
+SURE = 0.5
+"""Confidence of a segmentation from which a frame may be the first."""
+
+SURE_OF_PROMPT = 0.1
+"""The same where the user said what to look at."""
+
+SURE_OF_FRONT = 0.01
+"""Nats per point by which a box that is turned otherwise must be worse."""
+
+FIRST_FRAMES = 10
+"""Frames among which the first that shows the object well is looked for."""
+
+_FLOOR_MARGIN = 0.02  # metres above the floor below which nothing counts as the object
+_ROOM = 0.15  # by which a box that was estimated is enlarged before the object is cut out with it
+
+
+class Start(NamedTuple):
+    """The object as it was found in one frame, the first of the map."""
+
+    index: int
+    """Of the frame."""
+    masked: Bool[np.ndarray, "h w"] | None
+    """Pixels of that frame that show the object; None where the box alone tells."""
+    box: Box
+    T_world_camera: Float[np.ndarray, "4 4"]
+    T_level_world: Float[np.ndarray, "4 4"] | None
+    """To a frame with the same origin and +y up; None where the box was given and stays."""
+    floor: float
+    """Height of the floor in the level frame, in metres; NaN where it is not known."""
+    placement: Placement | None
+    notes: tuple[str, ...]
+    """What was found and how sure that is, in sentences."""
+    warnings: tuple[str, ...]
+    """Those of the notes that a user should look at."""
+
+
+def room(start: Start) -> float:
+    """By how much the box is enlarged to cut out the object: not where it was given."""
+    return 0.0 if start.T_level_world is None else _ROOM
+
+
+def find_start(
+    sequence: Sequence,
+    prior: ShapePrior,
+    prompt: Prompt,
+    *,
+    box: Box | None = None,
+    first: int = 0,
+    use_pose: bool = True,
+) -> Start:
+    """Find the object in the first frame that shows it well, from `first` on.
+
+    With a box nothing is searched for: it lies in the world of the given poses or, without these,
+    of the camera of the first frame. Else the object is cut out of the frame (`segment`) and placed
+    by the prior (`place`), upright on the floor if that is seen.
+
+    Raises `SequenceError` where no frame is good enough.
+    """
+    use_pose = use_pose and sequence.has_poses
+    if box is not None:
+        index, frame = _first_readable(sequence, first, use_pose)
+        T = _world_pose(frame, use_pose)
+        return Start(index, frame.mask, box, T, None, np.nan, None, (), ())
+    reasons = []
+    for index in range(first, min(first + FIRST_FRAMES, len(sequence))):
+        try:
+            frame = sequence[index]
+        except SequenceError as problem:
+            reasons.append(f"{sequence.names[index]}: {problem}")
+            continue
+        if use_pose and frame.T_world_camera is None:
+            reasons.append(f"{frame.name}: It has no pose.")
+            continue
+        found = segment(frame.depth, frame.color, sequence.intrinsics, prompt, frame.mask)
+        if found.confidence >= (SURE_OF_PROMPT if _is_prompted(prompt) else SURE):
+            return _place_first(sequence, prior, index, frame, found, use_pose)
+        reasons.append(f"{frame.name}: {found.reason}")
+        if _is_prompted(prompt):
+            break  # a place in one image means nothing in another
+    raise SequenceError(
+        "The object was not found; say where it is with --click, --region, --depth-range or --box, "
+        "or give masks. " + " ".join(reasons[:3])
+    )
+
+
+def _is_prompted(prompt: Prompt) -> bool:
+    return prompt != Prompt()
+
+
+def _first_readable(sequence: Sequence, first: int, use_pose: bool) -> tuple[int, Frame]:
+    problem: Exception | None = None
+    for index in range(first, len(sequence)):
+        try:
+            frame = sequence[index]
+        except SequenceError as error:
+            problem = error
+            continue
+        if not use_pose or frame.T_world_camera is not None:
+            return index, frame
+    raise problem or SequenceError("No frame of the recording has a pose.")
+
+
+def _world_pose(frame: Frame, use_pose: bool) -> Float[np.ndarray, "4 4"]:
+    if use_pose and frame.T_world_camera is not None:
+        return np.asarray(frame.T_world_camera, np.float64)
+    return np.eye(4)
+
+
+def _place_first(
+    sequence: Sequence,
+    prior: ShapePrior,
+    index: int,
+    frame: Frame,
+    found: Segmentation,
+    use_pose: bool,
+) -> Start:
+    T_world_camera = _world_pose(frame, use_pose)
+    floor = _floor(frame, sequence, found)
+    up, of_up = _up(floor, T_world_camera, use_pose)
+    cut = f"{frame.name}: {found.reason}"
+    doubts = [cut] * (found.confidence < SURE) + [of_up] * (floor is None)
+    T_level_world = np.eye(4)
+    T_level_world[:3, :3] = _rotation_onto_y(up)
+    prepared = prepare(frame, sequence.intrinsics)
+    start = Start(
+        index=index,
+        masked=found.segmented,
+        box=Box(np.eye(4), np.ones(3)),
+        T_world_camera=T_world_camera,
+        T_level_world=T_level_world,
+        floor=_floor_height(floor, T_level_world @ T_world_camera),
+        placement=None,
+        notes=(cut, of_up),
+        warnings=tuple(doubts),
+    )
+    masked = resized(found.segmented, prepared.view.depth.shape)
+    seen = (prepared.view.depth, masked, prepared.view.intrinsics, T_world_camera)
+    start = _placed(start, prior, [seen])
+    if start.placement is None:
+        raise SequenceError(
+            f"{frame.name}: the object was cut out, but too little of it to place it; give another "
+            "--first frame, --click elsewhere, or its --box."
+        )
+    return _with_doubt_of_front(start)
+
+
+def _with_doubt_of_front(start: Start) -> Start:
+    assert start.placement is not None
+    if start.placement.margin >= SURE_OF_FRONT:
+        return start
+    doubt = "Its front is not sure: it is symmetric, or was first seen from where that is hidden."
+    return start._replace(notes=(*start.notes, doubt), warnings=(*start.warnings, doubt))
+
+
+def _floor(frame: Frame, sequence: Sequence, found: Segmentation) -> Floor | None:
+    points = camera_points(frame.depth, sequence.intrinsics)
+    known = frame.depth > 0
+    planes = dominant_planes(points[known])
+    return floor_plane(points[known], planes, points[found.segmented & known])
+
+
+def _up(
+    floor: Floor | None, T_world_camera: Float[np.ndarray, "4 4"], has_poses: bool
+) -> tuple[Float[np.ndarray, " 3"], str]:
+    """The upward direction in the world, and where it comes from."""
+    if floor is not None:
+        up = T_world_camera[:3, :3] @ np.asarray(floor.plane.normal, np.float64)
+        return up, f"Up is the normal of the floor ({floor.confidence:.0%} sure)."
+    if has_poses:
+        return np.array([0.0, 1.0, 0.0]), "No floor is seen; the world's +y is taken as up."
+    up = -T_world_camera[:3, 1]
+    return up, "No floor is seen; the camera of the first frame is taken as held level."
+
+
+def _floor_height(floor: Floor | None, T_level_camera: Float[np.ndarray, "4 4"]) -> float:
+    """y of the floor in the level frame, where it is sure; else NaN."""
+    if floor is None or floor.confidence < SURE:
+        return np.nan
+    on_floor = -floor.plane.offset * np.asarray(floor.plane.normal, np.float64)
+    return float((T_level_camera[:3, :3] @ on_floor + T_level_camera[:3, 3])[1])
+
+
+def _rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation that takes `up` to +y, and turns as little else as it can."""
+    y = up / np.linalg.norm(up)
+    sideways = np.eye(3)[np.argmin(np.abs(y))]
+    x = np.eye(3)[0] if abs(y[0]) < 0.9 else sideways
+    z = np.cross(x, y)
+    z /= np.linalg.norm(z)
+    return np.stack([np.cross(y, z), y, z])
+
+
+# Placement --------------------------------------------------------------------------------------
+
+
+def placed_again(start: Start, prior: ShapePrior, keyframes: tuple[Keyframe, ...]) -> Start:
+    """The start with its box estimated from all keyframes, from its earlier placement on."""
+    seen = [
+        (one.depth, one.segmented, one.intrinsics, np.asarray(one.T_world_camera.as_matrix()))
+        for one in keyframes
+    ]
+    return _placed(start, prior, seen)
+
+
+def _placed(start: Start, prior: ShapePrior, frames: list) -> Start:
+    """The start with the box that the prior finds; as it is where nothing can be placed."""
+    assert start.T_level_world is not None
+    known = start.placement or placing.nothing_known(prior)
+    each = [
+        _sample_rays(jax.random.key(number), depth, masked, intrinsics)
+        for number, (depth, masked, intrinsics, _) in enumerate(frames)
+    ]
+    poses = [as_pose(start.T_level_world @ T_world_camera) for *_, T_world_camera in frames]
+    seen = _pooled(_stacked(each), _stacked(poses))
+    found = _place(prior, seen, jnp.float32(start.floor), known)
+    if not np.isfinite(found.misfit):
+        return start
+    T_level_object = np.asarray(found.T_world_object.as_matrix(), np.float64)
+    box = Box(np.linalg.inv(start.T_level_world) @ T_level_object, np.asarray(found.size, float))
+    return start._replace(placement=found, box=_without_floor(box, start.floor))
+
+
+def _stacked(trees: list[Any]) -> Any:
+    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+
+_sample_rays = jax.jit(sample_rays)
+_pooled = jax.jit(pooled)
+_place = jax.jit(placing.place)
+
+
+def _without_floor(box: Box, floor: float) -> Box:
+    """The box, with what lies on the floor excluded."""
+    if not np.isfinite(floor):
+        return box
+    bottom = -box.size[1] / 2
+    slab = [[-9.0, -9.0, -9.0], [9.0, bottom + _FLOOR_MARGIN, 9.0]]
+    return box._replace(exclude=np.array([slab]))

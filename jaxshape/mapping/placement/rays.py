@@ -1,0 +1,108 @@
+"""What depth frames say of the place of an object: points on it, and points that are free.
+
+Always the same number of them, however large the images are and however many: whatever compares
+boxes by them is compiled once.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from jaxshape.geometry import camera
+from jaxshape.geometry.camera import Intrinsics
+
+SURFACE_POINTS, FREE_POINTS = 8192, 4096
+"""Of each frame: points on the object, enough to fill a grid, and points that rays passed."""
+
+REACH = 1.2
+"""Radius of the ball around the object in which rays count, in typical extents."""
+
+FREE_GAP = 0.06
+"""The end of a ray in front of what it met that does not count as free, in typical extents: noise,
+and the thickness of a voxel."""
+
+
+class RaySamples(NamedTuple):
+    """What depth frames say of the place of an object."""
+
+    surface: Float[Array, "*batch n 3"]
+    """Measured points of the object, in metres and in random order."""
+    free: Float[Array, "*batch m 3"]
+    """Points that were seen through, spread evenly over the free rays around the object."""
+    away: Float[Array, "*batch 3"]
+    """The direction from the camera to the object; for several frames, the mean of the unit
+    vectors, so that it is short where the object was seen from all sides."""
+
+
+def sample_rays(
+    key: Key[Array, ""],
+    depth: Float[Array, "h w"],
+    segmented: Bool[Array, "h w"],
+    intrinsics: Intrinsics,
+    extent: float = 0.7,
+) -> RaySamples:
+    """What one frame says, in the frame of its camera; the same number of points for every frame.
+
+    `depth` is in metres, 0 where nothing is known and infinite where the ray met nothing;
+    `segmented` is True on the object, which measures some `extent` metres. All rays free space, as
+    far as they pass by the object. NaN where no segmented pixel has a depth.
+    """
+    surface_key, ray_key, depth_key = jax.random.split(key, 3)
+    rays = camera.unproject(intrinsics, jnp.ones_like(depth)).reshape(-1, 3)
+    end, is_object = depth.ravel(), segmented.ravel()
+    is_object &= (end > 0) & jnp.isfinite(end)
+    points = rays * jnp.where(is_object, end, jnp.nan)[:, None]
+    center = jnp.nanmean(points, axis=0)
+
+    # Rays are free from where they enter a ball around the object until shortly before their end.
+    near, far = _through_ball(rays, center, REACH * extent)
+    far = jnp.minimum(far, end - FREE_GAP * extent)
+    length = jnp.where(jnp.isnan(center[0]), 0, jnp.maximum(far - near, 0))
+    ray = _draw(ray_key, jnp.int32(length / (REACH * extent) * 500), FREE_POINTS)
+    z = near[ray] + length[ray] * jax.random.uniform(depth_key, ray.shape)
+    return RaySamples(
+        surface=points[_draw(surface_key, jnp.int32(is_object), SURFACE_POINTS)],
+        free=rays[ray] * z[:, None],
+        away=center / jnp.linalg.norm(center),
+    )
+
+
+def _through_ball(
+    rays: Float[Array, "n 3"], center: Float[Array, " 3"], radius: float
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Where rays from the origin enter a ball and leave it, as factors; equal where they miss."""
+    squared = jnp.sum(rays**2, axis=-1)
+    middle = rays @ center / squared
+    half = jnp.sqrt(jnp.maximum(middle**2 - (center @ center - radius**2) / squared, 0))
+    return jnp.maximum(middle - half, 0), middle + half
+
+
+def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Array, " k"]:
+    """Indices drawn with replacement, in proportion to their weights; those of none never.
+
+    Weights are whole numbers, for rounding in a running sum would let any index be drawn.
+    """
+    total = jnp.cumsum(weight)
+    mark = jax.random.randint(key, (count,), 0, total[-1])
+    return jnp.searchsorted(total, mark, side="right")
+
+
+def pooled(samples: RaySamples, T_world_camera: jaxlie.SE3) -> RaySamples:
+    """What the frames of a leading axis say together, in the world, in as many points as of one.
+
+    Frames in which nothing was segmented are left out.
+    """
+    is_empty = jnp.isnan(samples.away[:, 0])
+    frames = jnp.argsort(is_empty)  # the others first
+    count = jnp.maximum(jnp.sum(~is_empty), 1)
+
+    def some_of_each(points):
+        points = camera.transform(T_world_camera, points)
+        place = jnp.arange(points.shape[1])
+        return points[frames[place % count], place]  # which are in random order
+
+    away = jnp.nanmean(T_world_camera.rotation() @ samples.away, axis=0)
+    return RaySamples(some_of_each(samples.surface), some_of_each(samples.free), away)

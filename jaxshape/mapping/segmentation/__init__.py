@@ -1,0 +1,1 @@
+"""Which pixels of a depth frame show the object: planes, clusters, and the choice among them."""

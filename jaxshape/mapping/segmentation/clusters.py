@@ -1,0 +1,242 @@
+"""What a depth frame falls into once floor, walls and table tops are out of it. [host]"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, KDTree, QhullError
+
+from jaxshape.geometry.sensor import tolerance
+from jaxshape.mapping.segmentation.planes import (
+    Floor,
+    Plane,
+    camera_points,
+    dominant_planes,
+    floor_plane,
+    height_above,
+    nothing_below,
+    on_plane,
+)  # fmt: skip
+
+WORKING_WIDTH = 320
+"""Clusters are found in images of about this width, in pixels."""
+
+WALL, TABLE, SHEET = 0.75, 0.5, 1.2
+"""A plane is no part of the object if its shorter side, in metres, exceeds the first where nothing
+is seen behind it, the second where it is level and higher than a seat, the third anywhere."""
+
+SEAT = 0.6
+"""Level planes higher than this above the floor, in metres, are seats only if they are small."""
+
+FURNITURE = 1.5
+"""A cluster longer than this, in metres, is not joined to one that is already chosen."""
+
+HIDDEN = 0.4
+"""How much of the height, in metres, between two parts of an object may be hidden."""
+
+GROWTH = 0.1
+"""How far, in metres, legs may stand outside the footprint of what is above them."""
+
+SMALLEST = 12
+"""Clusters of fewer pixels are noise."""
+
+SURE_FLOOR = 0.3
+"""A floor less certain than this may be a table top, and would cut all that is below it."""
+
+Image = Bool[np.ndarray, "h w"]
+Pixel = tuple[float, float]
+
+
+class Scene(NamedTuple):
+    """A depth frame reduced to the working width, and its planes."""
+
+    stride: int
+    """Of this many rows and columns of the frame, the middle one is kept."""
+    points: Float[np.ndarray, "h w 3"]
+    """Camera frame, metres; NaN where nothing was measured."""
+    spacing: float
+    """Metres between the rays of neighbouring pixels, at a depth of 1 m."""
+    planes: list[Plane]
+    floor: Floor | None
+    """None where no plane is sure to be the floor."""
+
+    @property
+    def z(self) -> Float[np.ndarray, "h w"]:
+        return self.points[..., 2]
+
+
+def look(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> Scene:
+    """The reduced frame, its planes, and the floor among them."""
+    stride = max(1, round(depth.shape[1] / WORKING_WIDTH))
+    points = reduced(camera_points(depth, K), stride)
+    cloud = points.reshape(-1, 3)
+    planes = dominant_planes(cloud)
+    floor = floor_plane(cloud, planes)
+    if floor is not None and floor.confidence < SURE_FLOOR:
+        floor = None
+    return Scene(stride, points, stride / float(K[0, 0]), planes, floor)
+
+
+def reduced(image: np.ndarray, stride: int) -> np.ndarray:
+    """The middle one of every `stride` rows and columns."""
+    return image[stride // 2 :: stride, stride // 2 :: stride]
+
+
+def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> np.ndarray:
+    """A segmentation at full size: each pixel is as that, of those around it, nearest in depth."""
+    (h, w), stride = segmented.shape, view.stride
+    if stride == 1:
+        return segmented
+    row, column = (np.arange(size) // stride for size in depth.shape)
+    best, found = tolerance(depth), np.zeros(depth.shape, bool)
+    for down, right in ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)):
+        pixel = np.ix_(np.clip(row + down, 0, h - 1), np.clip(column + right, 0, w - 1))
+        apart = np.abs(view.z[pixel] - depth)
+        nearer = apart < best  # False for NaN
+        found = np.where(nearer, segmented[pixel], found)
+        best = np.where(nearer, apart, best)
+    return found
+
+
+# What is not the object ------------------------------------------------------------------------
+
+
+def background(view: Scene, click: Pixel | None) -> Image:
+    """True on and behind floor and walls, and on table tops, unless they were clicked on."""
+    floor = None if view.floor is None else view.floor.plane
+    found = np.zeros(view.z.shape, bool) if floor is None else _beyond(view, floor)
+    for plane in view.planes:
+        if plane is floor:
+            continue
+        # A plane goes on through whatever stands across it: what counts are its connected parts.
+        labels = clusters(view, on_plane(plane, view.points) & ~found)
+        parts = [labels == label for label in range(1, labels.max() + 1)]
+        parts = [part for part in parts if not _is_clicked(part, click)]
+        sides = [_shorter_side(view.points[part]) for part in parts]
+        if _is_wall(plane, parts, sides, view):
+            found |= _beyond(view, plane)
+        limit = TABLE if floor is not None and _is_table_top(plane, floor) else SHEET
+        for part, side in zip(parts, sides, strict=True):
+            found |= part & (side > limit)
+    return found
+
+
+def _beyond(view: Scene, plane: Plane) -> Image:
+    """True on a plane and behind it."""
+    return height_above(plane, view.points) < tolerance(view.z)
+
+
+def _is_clicked(part: Image, click: Pixel | None) -> bool:
+    return click is not None and distance(part, click) < 2
+
+
+def distance(segmented: Image, target: Pixel) -> float:
+    """Distance, in pixels, from a point to the nearest pixel that is segmented."""
+    row, column = np.nonzero(segmented)
+    return float(np.hypot(row - target[0], column - target[1]).min(initial=np.inf))
+
+
+def _shorter_side(points: Float[np.ndarray, "n 3"]) -> float:
+    """The shorter side, in metres, of a rectangle whose points scatter as much as these."""
+    return float(np.sqrt(12 * np.linalg.eigvalsh(np.cov(points.T))[1]))
+
+
+def _is_wall(plane: Plane, parts: list[Image], sides: list[float], view: Scene) -> bool:
+    """Large, cut by the border of the image, and with next to nothing seen behind it."""
+    large = any(side > WALL and cut(part) > 0 for part, side in zip(parts, sides, strict=True))
+    return large and nothing_below(plane, view.points.reshape(-1, 3)) > 0
+
+
+def _is_table_top(plane: Plane, floor: Plane) -> bool:
+    """Level, and higher above the floor than a seat."""
+    level = plane.normal @ floor.normal > np.cos(np.deg2rad(8))
+    return bool(level) and floor.offset - plane.offset > SEAT
+
+
+def cut(segmented: Image) -> float:
+    """Share, from 0 to 1, of an outline that lies on the border of the image."""
+    border = segmented[[0, -1]].sum() + segmented[:, [0, -1]].sum()
+    return min(1.0, float(border / max(1.0, 4 * np.sqrt(segmented.sum()))))
+
+
+# Clusters --------------------------------------------------------------------------------------
+
+
+def clusters(view: Scene, free: Image) -> Int[np.ndarray, "h w"]:
+    """Connected free pixels without a jump in depth between them: 1, 2, ...; 0 elsewhere."""
+    index = np.arange(free.size).reshape(free.shape)
+    across = free[:, 1:] & free[:, :-1] & ~jumps(view.z[:, 1:], view.z[:, :-1], view.spacing)
+    down = free[1:] & free[:-1] & ~jumps(view.z[1:], view.z[:-1], view.spacing)
+    first = np.concatenate([index[:, 1:][across], index[1:][down]])
+    second = np.concatenate([index[:, :-1][across], index[:-1][down]])
+    edges = coo_array((np.ones(len(first), bool), (first, second)), shape=(free.size,) * 2)
+    labels = connected_components(edges, directed=False)[1].reshape(free.shape)
+    kept = np.bincount(labels[free], minlength=labels.max() + 1) >= SMALLEST
+    return np.where(free & kept[labels], np.cumsum(kept)[labels], 0)
+
+
+def jumps(
+    z: Float[np.ndarray, "h w"], other: Float[np.ndarray, "h w"], spacing: float
+) -> Bool[np.ndarray, "h w"]:
+    """Whether two depths of neighbouring pixels are of two surfaces; noise and slopes are not."""
+    nearer = np.fmin(z, other)
+    return np.abs(z - other) > tolerance(nearer) + 2.5 * spacing * nearer
+
+
+def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
+    """The main cluster, and those that belong to it: legs and slats which its own parts cut off.
+
+    Clusters belong together if most of one stands on the footprint of the other, which is no larger
+    than furniture, or if one is much smaller and next to the other in space.
+    """
+    clouds = {label: view.points[labels == label] for label in range(1, labels.max() + 1)}
+    chosen, others = [main], set(clouds) - {main}
+    while True:
+        body = np.concatenate([clouds[label] for label in chosen])
+        new = [label for label in sorted(others) if _belongs(clouds[label], body, view.floor)]
+        if not new:
+            return chosen
+        chosen, others = chosen + new, others - set(new)
+
+
+def _belongs(
+    piece: Float[np.ndarray, "n 3"], body: Float[np.ndarray, "m 3"], floor: Floor | None
+) -> bool:
+    if floor is not None and _apart_in_height(piece, body, floor.plane) < HIDDEN:
+        above = over_footprint(piece, body, floor.plane).mean() > 0.6
+        below = over_footprint(body, piece, floor.plane).mean() > 0.8
+        if above or (below and np.ptp(piece, axis=0).max() < FURNITURE):
+            return True
+    gap = float(tolerance(piece[:, 2]).mean())
+    nearest = KDTree(body).query(piece, distance_upper_bound=gap)[0].min()
+    return len(piece) < 0.2 * len(body) and bool(nearest < gap)
+
+
+def _apart_in_height(
+    first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "m 3"], floor: Plane
+) -> float:
+    """The gap, in metres, between the heights that two clusters span; negative if they overlap."""
+    a, b = height_above(floor, first), height_above(floor, second)
+    return float(max(a.min() - b.max(), b.min() - a.max()))
+
+
+def over_footprint(
+    points: Float[np.ndarray, "n 3"], body: Float[np.ndarray, "m 3"], floor: Plane
+) -> Bool[np.ndarray, " n"]:
+    """Whether points lie above the convex footprint, a little grown, of a body on the floor.
+
+    A body hides its own far side, so the footprint is made as deep as it is wide.
+    """
+    ahead = np.array([0.0, 0.0, 1.0]) - floor.normal[2] * floor.normal
+    ahead = ahead / max(np.linalg.norm(ahead), 1e-9)
+    axes = np.stack([np.cross(floor.normal, ahead), ahead])
+    seen = body @ axes.T
+    width, depth = np.ptp(seen, axis=0)
+    hidden = seen + [0, max(0.0, width - depth)]
+    try:
+        hull = ConvexHull(np.concatenate([seen, hidden])).equations
+    except QhullError:  # fewer than three points
+        return np.zeros(len(points), bool)
+    return (points @ axes.T @ hull[:, :2].T + hull[:, 2]).max(axis=1) < GROWTH

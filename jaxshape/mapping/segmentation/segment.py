@@ -1,0 +1,376 @@
+"""Which pixels of a depth frame show the object (paper, sections 3.1 and 4.3). [host]
+
+The paper thresholds depth by hand. Here the floor, the walls and table tops are taken out as
+planes; the rest falls apart into clusters where depth jumps; the cluster in the middle, or under a
+click, is the object; pieces that other parts of it cut off are joined where they stand on the same
+footprint; and its feet, which depth cannot tell from the floor, are found by their colour.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import mean
+from scipy.spatial import KDTree
+from skimage.color import rgb2lab
+from skimage.measure import label
+
+from jaxshape import checks
+from jaxshape.data.boxes import Box, points_in_box
+from jaxshape.geometry.sensor import tolerance
+from jaxshape.mapping.segmentation.clusters import (
+    Pixel,
+    Scene,
+    background,
+    clusters,
+    cut,
+    distance,
+    enlarged,
+    joined,
+    jumps,
+    look,
+    over_footprint,
+    reduced,
+)  # fmt: skip
+from jaxshape.mapping.segmentation.planes import (
+    Plane,
+    floor_plane,
+    height_above,
+    subsample,
+)
+
+SEPARABLE = 0.95
+"""Colours tell the object from the floor if they put this share of known pixels where they are."""
+
+CLICK_RADIUS = 4.0
+"""Pixels of the reduced image around a click that may be meant."""
+
+MOSTLY = 0.5
+"""Share of a cluster that must lie in the object's box to be part of it."""
+
+NEAR = 0.03
+"""Metres within which two frames have measured the same thing."""
+
+NOTHING = np.zeros((0, 3))
+"""No points."""
+
+CANDIDATES = 5
+"""Clusters that are joined with what belongs to them before one is chosen."""
+
+Doubt = tuple[float, str]
+"""Evidence from 0, against the segmentation, to 1, for it; and the doubt it raises, in words."""
+
+
+class Segmentation(NamedTuple):
+    """The pixels that show the object, and how sure that is."""
+
+    segmented: Bool[np.ndarray, "h w"]
+    confidence: float
+    """From 0 to 1."""
+    reason: str
+    """One sentence: what was found, and what makes it unsure."""
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """What a person says of where the object is; with nothing said it is sought in the middle."""
+
+    click: tuple[float, float] | None = None
+    """A point `(u, v)` of the image, in pixels, on the object."""
+    region: tuple[float, float, float, float] | None = None
+    """`(left, top, right, bottom)`, in pixels, around the object."""
+    depth_range: tuple[float, float] | None = None
+    """Nearest and farthest depth of the object, in metres."""
+
+    def __post_init__(self) -> None:
+        for coordinate in self.click or ():
+            checks.at_least("click", coordinate, 0)
+        left, top, right, bottom = self.region or (0, 0, 1, 1)
+        if not (left < right and top < bottom):
+            wanted = "left, top, right, bottom in pixels, with left < right and top < bottom"
+            checks.refuse("region", self.region, wanted)
+        near, far = self.depth_range or (0, 1)
+        if not 0 <= near < far:
+            wanted = "the nearest, then the farthest depth, in metres"
+            checks.refuse("depth_range", self.depth_range, wanted)
+
+
+def segment(
+    depth: Float[np.ndarray, "h w"],
+    color: UInt8[np.ndarray, "h w 3"] | None,
+    K: Float[np.ndarray, "3 3"],
+    prompt: Prompt = Prompt(),
+    mask: Bool[np.ndarray, "h w"] | None = None,
+) -> Segmentation:
+    """The pixels of one frame that measure the object: by its mask, by a prompt, or on its own.
+
+    `depth` is in metres, 0 or infinite where nothing was measured; such pixels are never segmented.
+    A given `mask`, True on the object, is taken as it is. Else what the prompt's depth range and
+    region leave is cleaned of floor, walls and table tops, and the cluster under the click, or the
+    one largest and nearest to the middle, is the object. A frame without depth, or without a
+    cluster, gives an empty segmentation of confidence 0 that says why.
+
+    Raises `ValueError` for a prompt that no pixel can meet.
+    """
+    check_prompt(prompt, depth.shape)
+    measured = (depth > 0) & np.isfinite(depth)
+    if not measured.any():
+        return _nothing(measured, "No pixel has a depth")
+    if mask is not None:
+        return _given(measured & mask)
+    allowed = measured & _prompted(prompt, depth)
+    clicked = prompt.click is not None
+    view = look(depth, K)
+    target = _target(prompt, view)
+    behind = background(view, target if clicked else None)
+    labels = clusters(view, reduced(allowed, view.stride) & ~behind)
+    if labels.max() == 0:
+        return _nothing(measured, "Nothing but floor, walls and table tops is seen there")
+    chosen, doubt = (_nearest if clicked else _most_central)(labels, view, target)
+    segmented = np.isin(labels, chosen)
+    if color is not None and view.floor is not None:
+        segmented |= _feet(segmented, reduced(color, view.stride), view, view.floor.plane)
+    doubts = [doubt, *_doubts(segmented, behind, view, clicked=clicked)]
+    return Segmentation(enlarged(segmented, view, depth) & allowed, *_judged(doubts, len(chosen)))
+
+
+def segment_inside(
+    depth: Float[np.ndarray, "h w"],
+    K: Float[np.ndarray, "3 3"],
+    box: Box,
+    T_world_camera: Float[np.ndarray, "4 4"],
+    others: Float[np.ndarray, "n 3"] = NOTHING,
+) -> Bool[np.ndarray, "h w"]:
+    """The pixels of a later frame that show the object, of which a box is known.
+
+    Those of the clusters that lie mostly in the box, and mostly not where earlier frames saw other
+    things, at the points `others`: a table that reaches into the box is left out, and what the
+    object has outside of it is not lost. Box and points are in the world, in metres.
+    """
+    view = look(depth, K)
+    known = np.isfinite(view.z)
+    points = view.points[known] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    ours = points_in_box(points, box)
+    if len(others):
+        ours &= np.isinf(KDTree(others).query(points, distance_upper_bound=NEAR)[0])
+    inside = np.zeros(known.shape, bool)
+    inside[known] = ours
+    labels = clusters(view, known & ~background(view, None))
+    shares = np.asarray(mean(inside, labels, np.arange(labels.max() + 1)))
+    chosen = np.flatnonzero(shares > MOSTLY)
+    return enlarged(np.isin(labels, chosen[chosen > 0]), view, depth)
+
+
+def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:
+    """Raise `ValueError` for a prompt that no pixel of an image of height and width can meet."""
+    h, w = shape
+    if prompt.click is not None:
+        u, v = prompt.click
+        if not (0 <= u < w and 0 <= v < h):
+            raise ValueError(
+                f"The click is at {u:g}, {v:g}; expected a point of the image of {w} x {h} pixels: "
+                "give column, then row."
+            )
+    if prompt.region is not None:
+        left, top, right, bottom = prompt.region
+        if not (max(left, 0) < min(right, w) and max(top, 0) < min(bottom, h)):
+            raise ValueError(
+                f"The region {prompt.region} holds no pixel of the image of {w} x {h}; expected "
+                "left, top, right, bottom in pixels."
+            )
+
+
+def _nothing(measured: Bool[np.ndarray, "h w"], reason: str) -> Segmentation:
+    return Segmentation(np.zeros_like(measured), 0.0, f"{reason}, so nothing is segmented.")
+
+
+def _given(segmented: Bool[np.ndarray, "h w"]) -> Segmentation:
+    if not segmented.any():
+        return _nothing(segmented, "The given mask holds no pixel with a depth")
+    return Segmentation(segmented, 1.0, f"The given mask: {segmented.sum()} pixels with a depth.")
+
+
+# Which cluster ---------------------------------------------------------------------------------
+
+
+def _prompted(prompt: Prompt, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The pixels within the prompt's region and depth range."""
+    h, w = depth.shape
+    near, far = prompt.depth_range or (0.0, np.inf)
+    left, top, right, bottom = prompt.region or (0.0, 0.0, w, h)
+    u, v = np.arange(w) + 0.5, np.arange(h)[:, None] + 0.5
+    within = (left <= u) & (u < right) & (top <= v) & (v < bottom)
+    return within & (near <= depth) & (depth <= far)
+
+
+def _target(prompt: Prompt, view: Scene) -> Pixel:
+    """Where in the reduced image, as row and column, the object is expected."""
+    h, w = view.z.shape
+    if prompt.click is not None:
+        u, v = prompt.click
+    elif prompt.region is not None:
+        left, top, right, bottom = prompt.region
+        u, v = (left + right) / 2, (top + bottom) / 2
+    else:
+        return (h - 1) / 2, (w - 1) / 2
+    return v / view.stride - 0.5, u / view.stride - 0.5
+
+
+def _nearest(labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel) -> tuple[list[int], Doubt]:
+    """The cluster at a click, with what belongs to it.
+
+    A click may slip, or fall between the slats of a back: of the clusters that fill a quarter of
+    the disc around it, the nearest to the camera is meant.
+    """
+    away = np.array([distance(labels == i, target) for i in range(1, labels.max() + 1)])
+    doubt = _falling(away.min(), 3.0, 15.0), "nothing stands where the click is"
+    row, column = np.indices(labels.shape)
+    disc = np.hypot(row - target[0], column - target[1]) <= CLICK_RADIUS
+    shares = np.array([np.mean(labels[disc] == i) for i in range(1, labels.max() + 1)])
+    depths = [
+        np.median(view.z[disc & (labels == i + 1)]) if share >= 0.25 else np.inf
+        for i, share in enumerate(shares)
+    ]
+    hit = np.argmin(depths) if np.isfinite(depths).any() else np.argmin(away)
+    return joined(labels, int(hit) + 1, view), doubt
+
+
+def _most_central(
+    labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel
+) -> tuple[list[int], Doubt]:
+    """Of the clusters, with what belongs to each, that which is worth most.
+
+    Pixels count by a Gaussian window about the target, for the square root of their number, so that
+    what fills the image is worth little, and for less where the border of the image cuts them.
+    """
+    row, column = np.indices(labels.shape)
+    away = np.hypot(row - target[0], column - target[1]) / (0.2 * labels.shape[1])
+    window = np.exp(-(away**2) / 2) * np.sqrt(np.nan_to_num(view.z))  # far things look small
+
+    def worth(group: list[int]) -> float:
+        pixels = np.isin(labels, group)
+        return float(window[pixels].sum() / np.sqrt(pixels.sum()) * (1 - cut(pixels)) ** 2)
+
+    seeds = sorted(range(1, labels.max() + 1), key=lambda i: -worth([i]))[:CANDIDATES]
+    groups = sorted((joined(labels, i, view) for i in seeds), key=lambda group: -worth(group))
+    rivals = [worth(group) for group in groups if not set(group) & set(groups[0])]
+    rival = max(rivals, default=0.0) / max(worth(groups[0]), 1e-9)
+    return groups[0], (_falling(rival, 0.3, 1.2), "something else is as large and central")
+
+
+# Feet on the floor -----------------------------------------------------------------------------
+
+
+def _feet(
+    segmented: Bool[np.ndarray, "h w"], color: UInt8[np.ndarray, "h w 3"], view: Scene, floor: Plane
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels that were taken for floor, but have the colour of the object above or beside them.
+
+    Shadows have its colour too, at times, but lie on the floor: a patch must on average be a little
+    above it. Empty where colours do not tell the object from the floor.
+    """
+    height = np.nan_to_num(height_above(floor, view.points) / tolerance(view.z), nan=9.0)
+    flat = (np.abs(height) < 1.5) & ~segmented
+    beside = flat.copy()
+    beside[flat] = over_footprint(view.points[flat], view.points[segmented], floor)
+    feet = np.zeros_like(segmented)
+    feet[beside] = _looks_like(rgb2lab(color), beside, segmented, flat & ~beside)
+    patches = _patches(feet)
+    raised = np.array(mean(height, patches, range(patches.max() + 1))) > 0.3
+    feet &= raised[patches]
+    attached = _patches(feet | segmented)
+    return feet & np.isin(attached, attached[segmented])
+
+
+def _patches(pixels: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
+    """Connected pixels, diagonals included: 1, 2, ...; 0 elsewhere."""
+    return np.asarray(label(pixels, connectivity=2))
+
+
+def _looks_like(
+    lab: Float[np.ndarray, "h w 3"],
+    doubtful: Bool[np.ndarray, "h w"],
+    ours: Bool[np.ndarray, "h w"],
+    others: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, " n"]:
+    """Whether most of the known pixels nearest in colour to each doubtful one are ours.
+
+    False for all where the same question, asked of the known pixels, gets too many wrong answers.
+    """
+    rng = np.random.default_rng(0)
+    known = [subsample(lab[pixels], 1000, rng) for pixels in (ours, others)]
+    unknown = lab[doubtful]
+    if min(len(unknown), *map(len, known)) < 10:
+        return np.zeros(len(unknown), bool)
+    tree = KDTree(np.concatenate(known))
+
+    def share_of_ours(colors, ranks):
+        return (tree.query(colors, k=ranks)[1] < len(known[0])).mean(axis=1)
+
+    shares = [share_of_ours(colors, range(2, 11)) for colors in known]  # the first is itself
+    right = (np.mean(shares[0] > 0.5) + np.mean(shares[1] < 0.5)) / 2
+    return (share_of_ours(unknown, range(1, 10)) > 0.7) & (right > SEPARABLE)
+
+
+# How sure --------------------------------------------------------------------------------------
+
+
+def _doubts(
+    segmented: Bool[np.ndarray, "h w"],
+    behind: Bool[np.ndarray, "h w"],
+    view: Scene,
+    *,
+    clicked: bool,
+) -> list[Doubt]:
+    """What the segmented pixels say for or against themselves.
+
+    What was clicked on need not be seen to stand on a floor: its feet may be out of sight.
+    """
+    hidden, touching = _outline(segmented, behind, view)
+    size = float(np.linalg.norm(np.ptp(view.points[segmented], axis=0)))
+    return [
+        (1 - _falling(segmented.mean(), 0.0, 0.01), "it covers hardly any of the image"),
+        (_falling(cut(segmented), 0.1, 0.6), "the border of the image cuts it"),
+        (_falling(hidden, 0.05, 0.35), "something nearer hides part of it"),
+        (_falling(touching, 0.1, 0.4), "it touches something that may or may not be part of it"),
+        (_falling(size, 2.0, 3.0), "it is larger than a piece of furniture"),
+        (max(_standing(segmented, view), 0.5 * clicked), "it is not seen to stand on a floor"),
+    ]
+
+
+def _falling(value: float, sure: float, unsure: float) -> float:
+    """1 up to `sure`, 0 from `unsure` on, linear between."""
+    return float(np.clip((unsure - value) / (unsure - sure), 0, 1))
+
+
+def _outline(
+    segmented: Bool[np.ndarray, "h w"], behind: Bool[np.ndarray, "h w"], view: Scene
+) -> tuple[float, float]:
+    """Shares of the outline at which something nearer begins, and at which the surface goes on."""
+    nearer = touching = total = 0
+    for turn in range(4):
+        z, inside, back = (np.rot90(image, turn) for image in (view.z, segmented, behind))
+        here, there = z[:, 1:], z[:, :-1]
+        edge = inside[:, 1:] & ~inside[:, :-1]
+        jump = jumps(here, there, view.spacing)
+        nearer += int((edge & jump & (there < here)).sum())
+        touching += int((edge & ~jump & np.isfinite(there) & ~back[:, :-1]).sum())
+        total += int(edge.sum())
+    return nearer / max(total, 1), touching / max(total, 1)
+
+
+def _standing(segmented: Bool[np.ndarray, "h w"], view: Scene) -> float:
+    """How sure it is that the object stands on the floor; half where no floor is seen."""
+    if view.floor is None:
+        return 0.5
+    floor = floor_plane(view.points.reshape(-1, 3), [view.floor.plane], view.points[segmented])
+    return floor.confidence if floor else 0.0
+
+
+def _judged(doubts: list[Doubt], pieces: int) -> tuple[float, str]:
+    """Confidence, the product of all evidence, and a sentence that names the weakest."""
+    weakest, doubt = min(doubts)
+    found = "One cluster" if pieces == 1 else f"{pieces} clusters that belong together"
+    verdict = doubt if weakest < 0.8 else "nothing speaks against it"
+    return float(np.prod([evidence for evidence, _ in doubts])), f"{found}: {verdict}."

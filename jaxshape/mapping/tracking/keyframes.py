@@ -1,0 +1,174 @@
+"""What the map keeps of frames, and where in the world the object's grids lie. [host]"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxshape.data.boxes import Box, points_in_box
+from jaxshape.data.sequences import Frame
+from jaxshape.geometry import grid
+from jaxshape.geometry.camera import Intrinsics, intrinsics_of
+from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.mapping.tracking import icp
+from jaxshape.mapping.tracking.icp import Cloud
+from jaxshape.mapping.tracking.surfels import CELLS, Lattice
+from jaxshape.mapping.tracking.views import DepthView, halved, view_of
+
+WORKING_WIDTH = 400
+"""Images wider than this are halved: tracking needs no more than 320 x 240 pixels."""
+
+_STRIDE = 2  # pixels between the points that a keyframe keeps
+
+
+class PreparedFrame(NamedTuple):
+    """One frame, prepared for tracking and mapping."""
+
+    view: DepthView
+    masked: Bool[Array, "h w"]
+    """Pixels that may show the object: a given mask, or all."""
+
+
+# Pixels that may show the object, from its box and the pose of the camera, both in the world.
+Cut = Callable[[Box, jaxlie.SE3], Bool[Array, "h w"]]
+
+
+class Keyframe(NamedTuple):
+    """What the map keeps of a frame."""
+
+    depth: Float[Array, "h w"]
+    masked: Bool[Array, "h w"]
+    """Pixels that may show the object: a given mask, or all."""
+    segmented: Bool[Array, "h w"]
+    """Those that do."""
+    intrinsics: Intrinsics
+    cloud: Cloud
+    """Oriented points of the object, in the frame of the camera."""
+    T_world_camera: jaxlie.SE3
+    T_previous_keyframe: jaxlie.SE3
+    """Relative to the keyframe before, as it was tracked."""
+    information: Float[Array, "6 6"]
+    """Of that relative pose, in the frame of the keyframe before; 0 for the first."""
+
+
+class Place(NamedTuple):
+    """Where the object's grids lie in the world."""
+
+    box: Box
+    cut: Box
+    """What lies in it is taken for the object."""
+    frame: GridFrame
+    lattice: Lattice
+
+
+def place_of(box: Box, room: float = 0.0, *, isotropic: bool = False) -> Place:
+    """The voxel frame and the lattice of the surface that fill a box.
+
+    The object is cut out by a box that is larger by the share `room`.
+    """
+    fit = grid.fit_box_isotropic if isotropic else grid.fit_box
+    frame = fit(jnp.float32(-box.size / 2), jnp.float32(box.size / 2))
+    R, t = box.T_world_object[:3, :3], box.T_world_object[:3, 3]
+    scale = CELLS / RESOLUTION / np.asarray(frame.voxel_size, np.float64)
+    linear = scale[:, None] * R.T
+    offset = -linear @ t - scale * np.asarray(frame.origin, np.float64)
+    cut = box._replace(size=(1 + room) * box.size)
+    return Place(box, cut, frame, Lattice(jnp.float32(linear), jnp.float32(offset)))
+
+
+def keyframe_of(
+    prepared: PreparedFrame,
+    place: Place,
+    T_world_camera: jaxlie.SE3,
+    odometry: tuple[jaxlie.SE3, Float[Array, "6 6"]] | None,
+    segmented: Bool[Array, "h w"] | None = None,
+) -> Keyframe:
+    """What the map keeps of a frame.
+
+    Args:
+        prepared: The frame.
+        place: Where the object's grids lie.
+        T_world_camera: The pose of the frame.
+        odometry: Its pose relative to the keyframe before, and the information of that; None for
+            the first.
+        segmented: The object's pixels; those in its box where they are not given.
+
+    Returns:
+        The keyframe.
+    """
+    if segmented is None:
+        segmented = object_pixels(prepared, place, T_world_camera)
+    T_previous, information = odometry or (jaxlie.SE3.identity(), jnp.zeros((6, 6)))
+    return Keyframe(
+        depth=prepared.view.depth,
+        masked=prepared.masked,
+        segmented=segmented,
+        intrinsics=prepared.view.intrinsics,
+        cloud=_cloud(prepared.view, segmented),
+        T_world_camera=T_world_camera,
+        T_previous_keyframe=T_previous,
+        information=information,
+    )
+
+
+def cut_anew(keyframe: Keyframe, place: Place) -> Keyframe:
+    """The keyframe with the object cut out of it by another box."""
+    prepared = PreparedFrame(view_again(keyframe.depth, keyframe.intrinsics), keyframe.masked)
+    segmented = object_pixels(prepared, place, keyframe.T_world_camera)
+    return keyframe._replace(segmented=segmented, cloud=_cloud(prepared.view, segmented))
+
+
+def object_pixels(
+    prepared: PreparedFrame, place: Place, T_world_camera: jaxlie.SE3
+) -> Bool[Array, "h w"]:
+    """Pixels that may show the object and whose points lie in its box."""
+    T = np.asarray(T_world_camera.as_matrix(), np.float64)
+    points = np.asarray(prepared.view.points, np.float64) @ T[:3, :3].T + T[:3, 3]
+    inside = points_in_box(points, place.cut) & (np.asarray(prepared.view.points[..., 2]) > 0)
+    return prepared.masked & inside
+
+
+_cloud = jax.jit(partial(icp.cloud_of, stride=_STRIDE))
+view_again = jax.jit(view_of)
+"""The view of a depth image that a keyframe kept."""
+
+
+# Frames ------------------------------------------------------------------------------------------
+
+
+def prepare(
+    frame: Frame, K: Float[np.ndarray, "3 3"], masked: Bool[np.ndarray, "h w"] | None = None
+) -> PreparedFrame:
+    """A frame at working size, with its oriented points; `masked` in place of its own mask."""
+    halvings = 0
+    while frame.depth.shape[1] >> halvings > WORKING_WIDTH:
+        halvings += 1
+    view = _view(jnp.asarray(frame.depth), intrinsics_of(K), halvings)
+    mask = frame.mask if masked is None else masked
+    if mask is None:
+        return PreparedFrame(view, jnp.ones(view.depth.shape, bool))
+    return PreparedFrame(view, resized(mask, view.depth.shape))
+
+
+@partial(jax.jit, static_argnums=2)
+def _view(depth, intrinsics, halvings: int):
+    for _ in range(halvings):
+        depth, intrinsics = halved(depth, intrinsics)
+    return view_of(depth, intrinsics)
+
+
+def resized(mask: Bool[np.ndarray, "h w"], shape: tuple[int, ...]) -> Bool[Array, "_ _"]:
+    """The mask at a whole fraction of its size: True where most of the pixels are."""
+    k = mask.shape[1] // shape[1]
+    h, w = shape[0] * k, shape[1] * k
+    return jnp.asarray(mask[:h, :w].reshape(shape[0], k, shape[1], k).mean(axis=(1, 3)) > 0.5)
+
+
+def as_pose(T: Float[np.ndarray, "4 4"]) -> jaxlie.SE3:
+    """A pose of the host in JAX."""
+    return jaxlie.SE3.from_matrix(jnp.float32(T)).normalize()

@@ -1,0 +1,119 @@
+"""Principal components of the training grids: the cheap rival of every network.
+
+A shape is the mean grid plus `d` components, `p = mean + code @ components`, and its logits are
+`slope (p - 1/2)`. The first code is the most probable one given the voxels that were measured: the
+codes of the training set are normal with the variances of their components, and what a voxel shows
+differs from `p` by independent noise.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model.shapes import Prepared, ShapeModel, ShapePrior
+
+PASSES = 4
+"""Power iterations of the randomised decomposition: the spectrum of shapes falls slowly."""
+
+OVERSAMPLING = 10
+"""Directions that are iterated besides the components that are kept (Halko et al., 2011)."""
+
+
+def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
+    """The most probable code given F where something was measured; M weighs the voxels."""
+    components = params["components"]
+    noise = params["noise"]
+
+    def one(occupied, known):
+        weighted = components * known
+        precision = weighted.reshape(len(components), -1) @ components.reshape(
+            len(components), -1
+        ).T + noise * jnp.diag(1 / params["variances"])
+        return jnp.linalg.solve(
+            precision, jnp.einsum("dxyz,xyz->d", weighted, occupied - params["mean"])
+        )
+
+    known = 1 - grids.occluded.astype(components.dtype)
+    return jax.lax.map(lambda x: one(*x), (grids.occupied.astype(components.dtype), known))
+
+
+def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y z"]:
+    """Logits of the grids that codes stand for."""
+    params = prepared.shared
+    p = params["mean"] + jnp.einsum(
+        "nd,dxyz->nxyz", code.astype(params["mean"].dtype), params["components"]
+    )
+    return params["slope"] * (p - 0.5)
+
+
+def shapes(params: PyTree) -> PyTree:
+    """The arrays, as shapes, of a basis with as many components of as many voxels."""
+    d, *grid = params["components"].shape
+    sizes = {"components": (d, *grid), "mean": grid, "variances": (d,), "slope": (), "noise": ()}
+    if len(set(grid)) != 1 or len(grid) != 3:
+        raise KeyError("components of cubic grids")
+    return {name: jax.ShapeDtypeStruct(tuple(size), jnp.float32) for name, size in sizes.items()}
+
+
+PCA = ShapeModel("pca", encode, decode, shapes=shapes)
+"""A linear basis."""
+
+
+def fit(surfaces: Bool[np.ndarray, "n x y z"], code: int, seed: int = 0) -> ShapePrior:
+    """The principal components of complete surfaces. [host]
+
+    Args:
+        surfaces: Occupancy grids of the training set, more than `code` of them.
+        code: Components to keep, the numbers in a code.
+        seed: Of the randomised decomposition.
+
+    Returns:
+        A shape prior of the model `PCA`; its codes have mean 0 and a diagonal covariance.
+
+    Raises:
+        ValueError: There are too few grids.
+    """
+    n, *grid = surfaces.shape
+    if n <= code:
+        raise ValueError(
+            f"There are {n} training grids for {code} components; give at least {code + 1} grids, "
+            "or a smaller code."
+        )
+    rows = surfaces.reshape(n, -1).astype(np.float32)
+    mean = rows.mean(axis=0)
+    rows -= mean
+    components, variances = _principal(rows, code, np.random.default_rng(seed))
+    left = float(np.mean((rows - (rows @ components.T) @ components) ** 2))
+    codes = rows @ components.T
+    fitted = mean + codes[:512] @ components
+    params = {
+        "components": components.reshape(code, *grid),
+        "mean": mean.reshape(grid),
+        "variances": variances,
+        "slope": np.float32(_best_slope(fitted, surfaces.reshape(n, -1)[:512])),
+        "noise": np.float32(left),
+    }
+    params = jax.tree.map(jnp.asarray, params)
+    return ShapePrior(PCA, params, jnp.zeros(code), jnp.diag(params["variances"]))
+
+
+def _principal(rows, count: int, rng: np.random.Generator):
+    """Leading principal components of centred rows, and their variances, by subspace iteration."""
+    width = min(count + OVERSAMPLING, len(rows))
+    basis = np.linalg.qr(rows.T @ rng.standard_normal((len(rows), width), np.float32))[0]
+    for _ in range(PASSES):
+        basis = np.linalg.qr(rows.T @ (rows @ basis))[0]
+    _, singular, components = np.linalg.svd(rows @ basis, full_matrices=False)
+    components = (components @ basis.T)[:count]
+    return components.astype(np.float32), (singular[:count] ** 2 / len(rows)).astype(np.float32)
+
+
+def _best_slope(p, occupied) -> float:
+    """The slope of the logits with the least cross-entropy, by Newton's method from 8."""
+    slope, x = 8.0, p.astype(np.float64) - 0.5
+    for _ in range(20):
+        q = 1 / (1 + np.exp(-slope * x))
+        slope -= np.mean((q - occupied) * x) / np.mean(q * (1 - q) * x**2)
+    return slope

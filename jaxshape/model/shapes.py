@@ -1,0 +1,195 @@
+"""The seam of every shape space: a model is three pure functions over a pytree of parameters.
+
+    first code = encode(params, grids)            F and M to a code, once per object
+    prepared   = prepare(params, grids, precision)  all that does not depend on the code, once
+    logits     = decode(prepared, codes)            thousands of times
+
+Everything outside `jaxshape.model` reaches a network through the `ShapeModel` that a `ShapePrior`
+carries beside its parameters. `autoencoder` and `pca` are members; docs/examples has one of yours.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model.chunks import in_chunks
+from jaxshape.model.config import Precision
+
+EXAMPLES_AT_A_TIME = 8
+"""Codes or grids that go through a model together on CPU: enough rows for its matrix products, few
+enough that temporaries stay small."""
+
+
+class Prepared(NamedTuple):
+    """Parameters made ready for many calls of `decode`.
+
+    Attributes:
+        shared: Pytree of arrays that all objects share: the network.
+        own: Pytree of arrays `[b ...]`, features of each object's own measurement. In a call of
+            `decode` with n codes it has n rows, one for each code. Empty for models that decode
+            from the code alone.
+    """
+
+    shared: PyTree
+    own: PyTree = ()
+
+
+def share_all(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
+    """The `prepare` of models without anything to prepare: the parameters as they are."""
+    del grids, precision
+    return Prepared(params)
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class ShapeModel:
+    """A space of shapes. Static under `jax.jit`: models are equal when their functions are.
+
+    Attributes:
+        kind: Name of the model, written into its weights files.
+        encode: `(params, grids [b ...]) -> codes [b d]`, the first code of each object.
+        decode: `(prepared, codes [n d]) -> logits [n x y z]`, occupied where positive.
+            Differentiable in the codes.
+        prepare: `(params, grids [b ...] | None, precision) -> Prepared`, called once per search.
+            `precision` is that of the products of `decode`. A model that decodes from the code
+            alone ignores the grids, and works without any.
+        shapes: `params -> ` the same tree of `jax.ShapeDtypeStruct`, for a model of the sizes that
+            the parameters seem to have; loading compares weights files with it. None compares
+            nothing but what `encode` and `decode` return.
+    """
+
+    kind: str
+    encode: Callable[[PyTree, Grids], Float[Array, "b d"]]
+    decode: Callable[[Prepared, Float[Array, "n d"]], Float[Array, "n x y z"]]
+    prepare: Callable[[PyTree, Grids | None, Precision], Prepared] = share_all
+    shapes: Callable[[PyTree], PyTree] | None = None
+
+
+class ShapePrior(NamedTuple):
+    """A trained shape model, and where in its code space the training shapes lie.
+
+    Attributes:
+        model: The functions, static under `jax.jit`.
+        params: Their parameters, a pytree of arrays.
+        code_mean: Mean code of the training set `[d]`.
+        code_covariance: Covariance of the codes of the training set `[d d]`, positive definite: the
+            scale on which a search takes its steps.
+    """
+
+    model: ShapeModel
+    params: PyTree
+    code_mean: Float[Array, " d"]
+    code_covariance: Float[Array, "d d"]
+
+    @property
+    def code_size(self) -> int:
+        """Numbers in a code."""
+        return self.code_mean.shape[-1]
+
+    @property
+    def resolution(self) -> int:
+        """Voxels along each axis of the grids."""
+        return resolution_of(self.model, self.params, self.code_size)
+
+
+def resolution_of(model: ShapeModel, params: PyTree, code_size: int) -> int:
+    """Voxels along each axis of what a model decodes."""
+
+    def decoded(params):
+        prepared = model.prepare(params, None, "float32")
+        return model.decode(prepared, jnp.zeros((1, code_size)))
+
+    return jax.eval_shape(decoded, params).shape[-1]
+
+
+def encode(prior: ShapePrior, grids: Grids) -> Float[Array, "*batch d"]:
+    """The code that a model proposes for what was measured: the start of a search (section 3.1).
+
+    Args:
+        prior: A shape prior.
+        grids: F and M at the prior's resolution, with any leading axes.
+
+    Returns:
+        One code for each object.
+
+    Raises:
+        ValueError: The grids are not of the prior's resolution.
+    """
+    require_resolution(prior, grids)
+    batch = grids.occupied.shape[:-3]
+    rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), grids)
+    count = len(rows.occupied)
+    of_rows = lambda index: prior.model.encode(prior.params, pick(rows, index))  # noqa: E731
+    return _a_few_at_a_time(of_rows, count).reshape(*batch, -1)
+
+
+def decode(
+    prior: ShapePrior, code: Float[Array, "*batch d"], grids: Grids | None = None
+) -> Float[Array, "*batch x y z"]:
+    """**Logits** of the occupancy that codes stand for; occupied where positive.
+
+    The paper's output in (0, 1) is `jax.nn.sigmoid(logits)`.
+
+    Args:
+        prior: A shape prior.
+        code: Codes with any leading axes, decoded by one call in bounded memory.
+        grids: F and M `[b ...]` of the objects, for models whose decoder is given the measurement;
+            the first axis of `code` is then theirs.
+    """
+    prepared = prior.model.prepare(prior.params, grids, "float32")
+    return decode_prepared(prior.model, prepared, code)
+
+
+def decode_prepared(
+    model: ShapeModel, prepared: Prepared, code: Float[Array, "*batch d"]
+) -> Float[Array, "*batch x y z"]:
+    """`decode` with parameters that are prepared already.
+
+    Args:
+        model: The model that prepared them.
+        prepared: Its parameters. Where it holds features of b objects, the first axis of `code`
+            has b entries.
+        code: Codes with any leading axes.
+    """
+    batch = code.shape[:-1]
+    rows = code.reshape(-1, code.shape[-1])
+    owners = len(jax.tree.leaves(prepared.own)[0]) if jax.tree.leaves(prepared.own) else 1
+    each = len(rows) // owners
+
+    def of_rows(index):
+        own = pick(prepared.own, index // each)
+        return model.decode(prepared._replace(own=own), rows[index])
+
+    logits = _a_few_at_a_time(of_rows, len(rows))
+    return logits.reshape(*batch, *logits.shape[1:])
+
+
+def pick(tree: PyTree, index: Int[Array, " n"] | int) -> PyTree:
+    """Rows, or one row, of every array of a tree."""
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+def _a_few_at_a_time(function: Callable[[Int[Array, " n"]], Any], count: int) -> Any:
+    """A function of the numbers of rows, on CPU for a few rows at a time."""
+    chunked = partial(in_chunks, function, EXAMPLES_AT_A_TIME)
+    return lax.platform_dependent(jnp.arange(count), cpu=chunked, default=function)
+
+
+def require_resolution(prior: ShapePrior, grids: Grids) -> None:
+    """Raise `ValueError` when F or M is not of the prior's resolution."""
+    n = prior.resolution
+    for name in ("occupied", "occluded"):
+        shape = np.shape(getattr(grids, name))
+        if shape[-3:] != (n, n, n):
+            raise ValueError(
+                f"{name} has shape {shape}; this prior knows shapes of {n} x {n} x {n} voxels, "
+                f"so give [..., {n}, {n}, {n}] (measure(..., resolution={n}))."
+            )

@@ -1,0 +1,143 @@
+"""What a search minimises: how badly a decoded shape agrees with what was measured.
+
+A `Residual` is two pure functions of ONE object and ONE candidate; the search batches them.
+
+    target = residual.target(grids, first_logits)    # once per object
+    loss   = residual.score(logits, target)          # for every candidate
+
+Members: Eq. 7 of the paper as printed (`PAPER`), the same with measured free space counted a third
+(`BALANCED`), and weighted by how sure each voxel is (`SOFT`). Your own needs no more than these two
+functions (docs/examples/own_residual.py).
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jaxshape.geometry.evidence import Grid, Grids, binary
+
+
+class Residual(NamedTuple):
+    """Two pure functions that score candidates; hashable, so that it can be static under jit.
+
+    Attributes:
+        target: `(grids, first_logits [x y z]) -> target`: a pytree of arrays, worked out once from
+            what was measured of an object and from its decoded first code, G(lambda_0).
+            `grids.data` holds what you gave to `reconstruct` besides F and M.
+        score: `(logits [x y z], target) -> loss`, a scalar in nats per voxel, differentiable in
+            the logits.
+    """
+
+    target: Callable[[Grids, Float[Array, "x y z"]], PyTree]
+    score: Callable[[Float[Array, "x y z"], PyTree], Float[Array, ""]]
+
+
+class Weights(NamedTuple):
+    """How the parts of Eq. 7 are weighed against measured occupied voxels.
+
+    Attributes:
+        free: Weight of measured free space (Eq. 7: 1). A lower weight keeps thin structures from
+            drowning in free space.
+        prior: Factor of alpha, the weight of the prior where nothing was measured (Eq. 7: 1).
+    """
+
+    free: float = 1.0
+    prior: Float[Array, ""] | float = 1.0
+
+
+AS_PRINTED, LESS_FREE = Weights(), Weights(free=1 / 3)
+
+
+class Target(NamedTuple):
+    """Weights of the two cross-entropy terms of each voxel.
+
+    Attributes:
+        occupied: Weight `[*batch x y z]` of -log p.
+        empty: Weight `[*batch x y z]` of -log (1 - p).
+    """
+
+    occupied: Float[Array, "*batch x y z"]
+    empty: Float[Array, "*batch x y z"]
+
+
+def weigh(
+    grids: Grids, first_logits: Float[Array, "*batch x y z"], weights: Weights = AS_PRINTED
+) -> Target:
+    """The weights of Eq. 7: F where something was seen, alpha times the prior elsewhere.
+
+    Args:
+        grids: F and M, binary or soft, `[*batch x y z]`.
+        first_logits: The decoded first code, G(lambda_0), as logits.
+        weights: Weights of measured free space and of the prior.
+
+    Returns:
+        The target of `cross_entropy`. alpha is sum(M) / sum(1 - M), times `weights.prior`; it is 0
+        where nothing is occluded, and where everything is, the sum over no voxels counts as one, so
+        that the prior alone decides.
+    """
+    axes = (-3, -2, -1)
+    M = _as_weights(grids.occluded, first_logits)
+    F = _as_weights(grids.occupied, first_logits)
+    G0 = jax.nn.sigmoid(first_logits)
+    alpha = M.sum(axes, keepdims=True) / jnp.maximum((1 - M).sum(axes, keepdims=True), 1)
+    alpha = weights.prior * alpha
+    return Target(
+        occupied=(1 - M) * F + alpha * M * G0,
+        empty=weights.free * (1 - M) * (1 - F) + alpha * M * (1 - G0),
+    )
+
+
+def _as_weights(grid: Grid, like: Array) -> Array:
+    return jnp.asarray(grid).astype(like.dtype)
+
+
+def cross_entropy(logits: Float[Array, "*batch x y z"], target: Target) -> Float[Array, "*batch"]:
+    """Eq. 7 from logits, in nats per voxel: f carries the 1 / N^3 of the training loss.
+
+    Args:
+        logits: Decoded shapes.
+        target: Weights of the same batch axes.
+    """
+    # -log sigmoid(l) = softplus(-l) = softplus(l) - l, and -log(1 - sigmoid(l)) = softplus(l).
+    softplus = jnp.maximum(logits, 0) + jnp.log(1 + jnp.exp(-jnp.abs(logits)))
+    # Sums written as products run several times faster on CPU than what XLA fuses into a mean.
+    over_voxels = partial(jnp.einsum, "...xyz,...xyz->...", precision="highest")
+    total = over_voxels(target.occupied + target.empty, softplus)
+    return (total - over_voxels(target.occupied, logits)) / math.prod(logits.shape[-3:])
+
+
+def equation_7(weights: Weights = AS_PRINTED) -> Residual:
+    """Eq. 7 of the paper, on binary F and M: soft grids are rounded.
+
+    Args:
+        weights: Those of Eq. 7 by default.
+    """
+    return Residual(lambda grids, logits: weigh(binary(grids), logits, weights), cross_entropy)
+
+
+def soft(weights: Weights = LESS_FREE) -> Residual:
+    """Eq. 7 with each voxel weighted by how sure its measurement is.
+
+    F and M are probabilities, as `soft_grids` gives them. A voxel that is known by half pulls half
+    as strongly towards what was measured there, and half towards the prior.
+
+    Args:
+        weights: Those of `BALANCED` by default.
+    """
+    return Residual(lambda grids, logits: weigh(grids, logits, weights), cross_entropy)
+
+
+PAPER = equation_7()
+"""Eq. 7 as printed."""
+BALANCED = equation_7(LESS_FREE)
+"""The best on procedural and CAD chairs, without noise and with it (experiments/objective.py)."""
+SOFT = soft()
+"""`BALANCED`, weighted by how sure each voxel is."""
+
+RESIDUALS = {"balanced": BALANCED, "paper": PAPER, "soft": SOFT}
+"""By the names that `RefineConfig.objective` takes."""

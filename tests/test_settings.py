@@ -1,0 +1,64 @@
+"""Every wrong value of the settings of data and mapping is refused where it is made."""
+
+import dataclasses
+import math
+
+import pytest
+
+from jaxshape.data.config import DatasetConfig, InputConfig
+from jaxshape.data.render import SensorNoise
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.placement.placing import PlacementConfig
+from jaxshape.mapping.segmentation.segment import Prompt
+
+SHARE = (-0.1, 1.5, math.nan)
+POSITIVE = (0.0, -1.0, math.inf, math.nan)
+COUNT = (0, -1)
+SWITCH = ("yes",)
+
+WRONG = {
+    DatasetConfig: {"views": COUNT, "noisy": SHARE, "up": ("w", "+x"), "front": ("",),
+                    "seed": (-1,)},
+    InputConfig: {"max_views": COUNT, "complete": SHARE, "mirror": SWITCH, "scale": (*SHARE, 1.0),
+                  "pose_error": SHARE, "missing": SHARE, "segmentation": SHARE},
+    SensorNoise: {"axial": (-1e-3, math.inf), "lateral": (-0.1, math.nan),
+                  "quantization": POSITIVE, "dropout": SHARE, "grazing": (-1.0, 181.0)},
+    TrackingConfig: {"against": ("maps", "Map"), "on": ("objects",), "min_inliers": SHARE,
+                     "sure_inliers": SHARE, "min_overlap": SHARE, "max_angle": POSITIVE,
+                     "max_distance": POSITIVE},
+    MappingConfig: {"keyframe_angle": POSITIVE, "keyframe_distance": POSITIVE, "realign": SWITCH,
+                    "isotropic": SWITCH, "min_hits": COUNT, "keyframe_iterations": COUNT},
+    PlacementConfig: {"typical_size": ((0.5, 0.0, 0.5),), "size_spread": ((0.5, math.nan, 0.5),),
+                      "yaws": COUNT, "overhangs": ((0.0, -0.2),), "kept": (*COUNT, 1000),
+                      "steps": COUNT, "steps_again": COUNT},
+    Prompt: {"click": ((-1.0, 5.0), (math.nan, 5.0)),
+             "region": ((30.0, 0.0, 20.0, 10.0), (0.0, 5.0, 9.0, 5.0)),
+             "depth_range": ((2.0, 1.0), (-1.0, 2.0), (1.0, math.nan))},
+}  # fmt: skip
+CASES = [
+    (settings, name, value)
+    for settings, fields in WRONG.items()
+    for name, values in fields.items()
+    for value in values
+]
+
+
+@pytest.mark.parametrize(("settings", "name", "value"), CASES)
+def test_a_wrong_value_is_refused_in_one_sentence(settings, name, value):
+    wrong = settings()
+    object.__setattr__(wrong, name, value)  # the tests' type checker would refuse it before
+    with pytest.raises(ValueError) as refusal:
+        wrong.__post_init__()
+    said = str(refusal.value)
+    assert said.startswith(f"{name} is ") and "; give " in said and said.endswith(".")
+    assert said.count(".") == said.rstrip(".").count(".") + 1
+
+
+@pytest.mark.parametrize("settings", WRONG)
+def test_no_field_goes_unchecked(settings):
+    assert set(WRONG[settings]) == {field.name for field in dataclasses.fields(settings)}
+
+
+def test_axes_on_one_line_are_refused():
+    with pytest.raises(ValueError, match="up is 'z' and front is 'z', but they must be perp"):
+        DatasetConfig(up="z")
