@@ -39,8 +39,7 @@ from scipy.stats import fisher_exact
 
 from jaxshape.files import write_json, write_text
 from jaxshape.report.palette import BLUE, ORANGE
-from jaxshape.search.batching import select
-from jaxshape.search.refiner import StopReason
+from jaxshape.search.refiner import StopReason, advance
 from jaxshape.search.restarts import with_restarts
 
 TARGETS = np.logspace(2, -8, 51)
@@ -174,29 +173,26 @@ def ours(dimension: int, restarts: Restarts) -> Search:
         shape = jax.ShapeDtypeStruct((), point.dtype)
         return jax.pure_callback(losses, shape, point, vmap_method="broadcast_all")
 
-    def move(key, state, number):
-        """One iteration of one instance; nothing where its search has stopped."""
-        running = state.stop == StopReason.RUNNING
-        awake = lambda point: objective(jnp.where(running, point, jnp.nan))  # noqa: E731
-        moved, _ = refiner.step(jax.random.fold_in(key, number), state, awake)
-        return select(running, moved, state)
+    def move(key, state, trace, number):
+        """One iteration of one instance."""
+        return advance(refiner, jax.random.fold_in(key, number), state, trace, objective)
 
     @jax.jit
-    def advance(keys, states, numbers):
-        def iterate(states, number):
-            return jax.vmap(move, (0, 0, None))(keys, states, number), None
+    def iterate(keys, now, numbers):
+        def move_all(now, number):
+            return jax.vmap(move, (0, 0, 0, None))(keys, *now, number), None
 
-        return jax.lax.scan(iterate, states, numbers)[0]
+        return jax.lax.scan(move_all, now, numbers)[0]
 
     def search(recorders):
         problems[:] = recorders
         keys = jax.vmap(jax.random.key)(jnp.array([_seed(r.problem) for r in recorders]))
         points = jnp.array([next(_starts(r.problem)) for r in recorders])
         unknown = jnp.full_like(points[:, 0], jnp.inf)
-        states, _ = jax.jit(jax.vmap(refiner.init))(keys, points, unknown)
+        now = jax.jit(jax.vmap(refiner.init))(keys, points, unknown)
         for step in itertools.count(0, STEPS):
-            states = advance(keys, states, jnp.arange(step, step + STEPS))
-            stopped = np.asarray(states.stop) != StopReason.RUNNING
+            now = iterate(keys, now, jnp.arange(step, step + STEPS))
+            stopped = np.asarray(now[0].stop) != StopReason.RUNNING
             if all(r.finished or s for r, s in zip(recorders, stopped, strict=True)):
                 break
 

@@ -20,9 +20,10 @@ from .model.weights import load_prior, save_prior
 from .report.page import write_report
 from .results.metrics import bounds, chamfer_l1, f_score, shape_scores
 from .results.surface import surface, write_mesh
-from .search.cma import cma
+from .search.cma import CmaState, cma_ask, cma_start, cma_tell
 from .search.config import RefineConfig
 from .search.methods import build_refiner
+from .search.methods.cma import cma
 from .search.methods.evosax import evosax_strategy
 from .search.methods.gradient import gradient
 from .search.methods.hybrid import polished
@@ -34,7 +35,17 @@ from .search.reconstruction import (
     reconstruct,
     refiner_for,
 )
-from .search.refiner import Distribution, Refiner, StopReason, Trace
+from .search.refiner import (
+    Candidate,
+    Distribution,
+    Refiner,
+    StopReason,
+    Trace,
+    finite_or_inf,
+    keep_better,
+    start_trace,
+    summarise,
+)
 from .search.residuals import (
     BALANCED,
     PAPER,
@@ -55,7 +66,9 @@ from .search.stopping import Tolerances
 __all__ = [
     "Architecture",
     "BALANCED",
+    "Candidate",
     "Capture",
+    "CmaState",
     "Distribution",
     "GridFrame",
     "Grids",
@@ -94,6 +107,9 @@ __all__ = [
     "capture",
     "chamfer_l1",
     "cma",
+    "cma_ask",
+    "cma_start",
+    "cma_tell",
     "compose",
     "cross_entropy",
     "decode",
@@ -103,12 +119,14 @@ __all__ = [
     "evosax_strategy",
     "f_score",
     "find_start",
+    "finite_or_inf",
     "fit_box",
     "fit_box_isotropic",
     "fit_surface",
     "follow",
     "gradient",
     "iou",
+    "keep_better",
     "load",
     "load_prior",
     "measure",
@@ -134,6 +152,8 @@ __all__ = [
     "segment",
     "shape_scores",
     "soft",
+    "start_trace",
+    "summarise",
     "surface",
     "trajectory",
     "weigh",

@@ -48,6 +48,7 @@ def commands(train: Train) -> Any:
 
 def main() -> None:
     """Run the command line; the entry point of the console script."""
+    sys.path.append("")  # the current folder may hold a search of the user's own
     warnings.showwarning = lambda message, *_, **__: console.print(f"[yellow]warning[/] {message}")
     table = commands(Train(config=preset_in(sys.argv[1:])))
     try:

@@ -13,7 +13,6 @@ from jaxshape.checks import BadSetting
 from jaxshape.cli.common import require
 from jaxshape.data.config import Axis, check_axes
 from jaxshape.model.config import TrainConfig
-from jaxshape.search.config import RefineConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,22 +105,6 @@ def _refusing(build: Callable[..., Any]) -> Callable[..., Any]:
             raise RefusedSetting(reworded(problem)) from problem
 
     return built
-
-
-def checked_search(search: RefineConfig) -> RefineConfig:
-    """The options of a search, once each is in its range."""
-    _require_each(
-        search,
-        ("iterations", search.iterations >= 1, "1 or more"),
-        ("population", search.population >= 3, "3 or more"),
-        ("sigma0", _positive(search.sigma0), "a number above 0"),
-        ("step_size", search.step_size is None or _positive(search.step_size), "a number above 0"),
-        ("bound", search.bound is None or _positive(search.bound), "a number above 0"),
-        ("prior_weight", 0 <= search.prior_weight < math.inf, "0 or more"),
-        ("tolerance", 0 <= search.tolerance < math.inf, "0 or more"),
-        ("target", search.target is None or not math.isnan(search.target), "a number"),
-    )
-    return search
 
 
 def checked_training(config: TrainConfig) -> TrainConfig:

@@ -1,6 +1,5 @@
 """`jaxshape demo`, and what it has in common with `jaxshape reconstruct`."""
 
-import pkgutil
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,15 +8,13 @@ from typing import Annotated, Any
 import tyro
 
 from jaxshape.cli.common import console, require
-from jaxshape.cli.options import checked_search
 from jaxshape.search.config import RefineConfig
+from jaxshape.search.names import families
 
-# Found as files: importing the package of the methods would import JAX.
-METHODS = ", ".join(
-    family.name
-    for family in pkgutil.iter_modules([str(Path(__file__).parents[1] / "search/methods")])
+VARIANTS = (
+    "cma:ipop, cma:bipop, gradient:OPTIMISER of optax, evosax:STRATEGY, "
+    "evosax:STRATEGY@POPULATION, hybrid:OPTIMISER"
 )
-VARIANTS = "cma:ipop, cma:bipop, gradient:OPTIMISER of optax, evosax:STRATEGY, hybrid:OPTIMISER"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +25,9 @@ class Rebuild:
         str,
         tyro.conf.arg(
             metavar="METHOD",
-            help=f"How the first code is searched on: encoder (not at all), {METHODS}, or a "
-            f"variant: {VARIANTS}.",
+            help="How the first code is searched on: encoder (not at all), "
+            f"{', '.join(families())}, a variant ({VARIANTS}), or a function of yours by its "
+            "import path, package.module:function.",
         ),
     ] = "cma"
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
@@ -43,8 +41,8 @@ class Rebuild:
         from jaxshape.model.weights import load_prior
         from jaxshape.search.reconstruction import refiner_for
 
-        config, prior = checked_search(self.search), load_prior(self.weights)
-        return prior, refiner_for(self.method, prior, config), config
+        prior = load_prior(self.weights)
+        return prior, refiner_for(self.method, prior, self.search), self.search
 
     def settings(self) -> dict[str, Any]:
         """What result.json says of the search."""

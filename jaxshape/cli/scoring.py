@@ -13,7 +13,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from jaxshape.cli.common import progress_bar, report_skipped, require
-from jaxshape.cli.options import Axes, checked_numbers, checked_search
+from jaxshape.cli.options import Axes, checked_numbers
 from jaxshape.files import write_json
 from jaxshape.search.config import RefineConfig
 
@@ -58,7 +58,7 @@ class Evaluate:
             methods=tuple(self.methods.split(",")),
             noise=self.noise,
             ceiling=self.ceiling,
-            refine=checked_search(self.search),
+            refine=self.search,
             seed=self.seed,
         )
         require(

@@ -40,3 +40,8 @@ def apply_if(due: Bool[Array, ""], function: Callable[..., Any], *operands: PyTr
 def select(wanted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
     """`new` where wanted, else `old`; for trees of the same shapes."""
     return jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, old)
+
+
+def cast_like(new: PyTree, old: PyTree) -> PyTree:
+    """`new` with the types of `old`, as a loop wants them; for trees of the same shapes."""
+    return jax.tree.map(lambda x, y: jnp.asarray(x, jnp.asarray(y).dtype), new, old)

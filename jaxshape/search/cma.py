@@ -2,8 +2,9 @@
 
 Equations and symbols follow Hansen, "The CMA Evolution Strategy: A Tutorial" (arXiv:1604.00772);
 constants are those of pycma 4.5, the package the paper used, which adds a step-size damping for
-large populations. `ask` and `tell` are the algorithm, `stopping.py` says when it is over, `cma`
-binds them to a `Refiner`, and `restarts.py` starts it again with larger populations.
+large populations. `cma_ask` and `cma_tell` are the algorithm, `rates.py` has its constants,
+`stopping.py` says when it is over, `methods/cma.py` binds them to a `Refiner`, and `restarts.py`
+starts it again with larger populations.
 """
 
 import math
@@ -13,155 +14,120 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxshape.checks import positive, whole
 from jaxshape.search import stopping
 from jaxshape.search.batching import apply_if
+from jaxshape.search.config import is_array
+from jaxshape.search.rates import Constants, constants, default_population
 from jaxshape.search.refiner import (
     Candidate,
     Distribution,
-    Objective,
-    Refiner,
     StopReason,
     Trace,
     finite_or_inf,
     keep_better,
     start_trace,
-    summarise,
 )
 from jaxshape.search.stopping import History, Tolerances
 
 
-class Constants(NamedTuple):
-    """What follows from the dimension and the population (tutorial, Table 1)."""
+class CmaState(NamedTuple):
+    """The distribution N(mean, sigma^2 C) of one search, and its best candidate.
 
-    weights: Float[Array, " capacity"]  # w_i; the positive ones sum to 1
-    mu_eff: Float[Array, ""]  # variance-effective number of parents
-    c_sigma: Float[Array, ""]  # rate of the step-size path
-    damping: Float[Array, ""]  # d_sigma
-    c_c: Float[Array, ""]  # rate of the covariance path
-    c_1: Float[Array, ""]  # rate of the rank-one update
-    c_mu: Float[Array, ""]  # rate of the rank-mu update
-    eigen_gap: Int[Array, ""]  # generations between eigendecompositions
-
-
-class State(NamedTuple):
-    """The distribution N(mean, sigma^2 C) of one search, and its best candidate."""
+    Attributes:
+        mean: Centre of the distribution.
+        best: The best candidate so far, the start included where its loss was given.
+        stop: Why the search ended, a `StopReason`; RUNNING as long as it goes on.
+        sigma: Step size.
+        covariance: C, symmetric and positive definite.
+        basis: B, eigenvectors of C as columns, as of the last decomposition.
+        scales: D, roots of the eigenvalues of C, ascending, as of the last decomposition.
+        path_sigma: p_sigma, the evolution path of the step size.
+        path_c: p_c, the evolution path of the covariance.
+        generation: How many generations the distribution has seen.
+        history: What the stop criteria remember.
+    """
 
     mean: Float[Array, " d"]
     best: Candidate
     stop: Int[Array, ""]
     sigma: Float[Array, ""]
-    covariance: Float[Array, "d d"]  # C
-    basis: Float[Array, "d d"]  # B, eigenvectors of C as columns, as of the last decomposition
-    scales: Float[Array, " d"]  # D, roots of its eigenvalues, ascending
-    path_sigma: Float[Array, " d"]  # p_sigma
-    path_c: Float[Array, " d"]  # p_c
+    covariance: Float[Array, "d d"]
+    basis: Float[Array, "d d"]
+    scales: Float[Array, " d"]
+    path_sigma: Float[Array, " d"]
+    path_c: Float[Array, " d"]
     generation: Int[Array, ""]
     history: History
 
 
-def default_population(dim: int) -> int:
-    """The number of candidates in one generation, 4 + floor(3 ln d)."""
-    return 4 + math.floor(3 * math.log(dim))
+def checked_population(dim: int, sigma0: Float[Array, ""] | float, population: int | None) -> int:
+    """The population, once the settings make a search; `ValueError` where they do not."""
+    whole("dim", dim, 1)
+    if not is_array(sigma0):
+        positive("sigma0", sigma0)
+    if population is None:
+        return default_population(dim)
+    whole("population", population, 3)  # CMA-ES ranks candidates
+    return population
 
 
-def cma(
+def cma_start(
+    point: Float[Array, " d"],
+    sigma0: Float[Array, ""] | float,
     *,
-    dim: int,
-    sigma0: float,
     population: int | None = None,
-    tolerances: Tolerances = Tolerances(),
-) -> Refiner:
-    """CMA-ES over points of `dim` numbers, starting from N(point, sigma0^2 I).
+    loss: Float[Array, ""] | float = math.inf,
+) -> CmaState:
+    """The distribution N(point, sigma0^2 I) before the first generation.
 
-    `population` is the number of candidates per iteration, pycma's 4 + floor(3 ln dim) by default.
-    To start from another covariance, search in another space (`space.py`). `resume` keeps mean,
-    sigma and C of an earlier search; its paths led down another objective. ValueError for a step
-    size or a population that makes no search.
+    With `cma_ask` and `cma_tell` for an own loop, in JAX or around a simulator:
+
+    >>> import jax, jax.numpy as jnp, jaxshape as js
+    >>> losses_of = jax.vmap(lambda x: jnp.sum((x - 3) ** 2))
+    >>> ask, tell = jax.jit(js.cma_ask, static_argnums=2), jax.jit(js.cma_tell)
+    >>> state = js.cma_start(jnp.zeros(5), sigma0=1.0)
+    >>> for key in jax.random.split(jax.random.key(0), 100):
+    ...     points = ask(key, state, 8)
+    ...     state = tell(state, points, losses_of(points))
+    >>> state.mean.round(2)
+    Array([3., 3., 3., 3., 3.], dtype=float32)
+
+    Args:
+        point: Centre of the distribution.
+        sigma0: Standard deviation of every coordinate, above 0.
+        population: Candidates per generation that the stop criteria of `stopping.check` reckon
+            with; None for pycma's 4 + floor(3 ln d).
+        loss: Of the point, where it is known; the point then counts as the best so far.
+
+    Returns:
+        The state of a search that has seen no generation. Its `stop` stays RUNNING under
+        `cma_tell`; `cma` is the search with stop criteria.
+
+    Raises:
+        ValueError: A setting is outside its range.
     """
-    size = default_population(dim) if population is None else population
-    require_settings(sigma0, size)
-
-    def init(key: Array, point: Float[Array, " d"], loss: Float[Array, ""]) -> tuple[State, Trace]:
-        del key  # the start is the given point
-        return started(start(Candidate(point, loss), sigma0, dim, size))
-
-    def step(key: Array, state: State, objective: Objective) -> tuple[State, Trace]:
-        points = ask(key, state, size)
-        losses = jax.vmap(objective)(points)
-        state = tell(state, points, losses, constants(dim, size))
-        state = stopping.check(state, losses, sigma0, size, tolerances)
-        evaluations = 1 + size * state.generation
-        return state, summarise(state.best, points, losses, evaluations, distribution(state))
-
-    def resume(key: Array, state: State, loss: Float[Array, ""]) -> tuple[State, Trace]:
-        fresh, _ = init(key, state.best.point, loss)
-        kept = {name: getattr(state, name) for name in _DISTRIBUTION}
-        return started(fresh._replace(**kept))
-
-    return Refiner(init, step, resume)
+    size = checked_population(len(point), sigma0, population)
+    return start(point, sigma0, len(point), size, jnp.asarray(loss, point.dtype))
 
 
-_DISTRIBUTION = ("mean", "sigma", "covariance", "basis", "scales")
-
-
-def require_settings(sigma0: float, population: int) -> None:
-    """ValueError for a step size or a population that makes no search."""
-    if not (math.isfinite(sigma0) and sigma0 > 0):
-        raise ValueError(f"sigma0 is {sigma0}; it is a standard deviation, so give one above 0.")
-    if population < 3:
-        raise ValueError(
-            f"The population is {population}; CMA-ES ranks candidates, so give 3 or more."
-        )
-
-
-def constants(dim: int, population: int | Int[Array, ""], capacity: int | None = None) -> Constants:
-    """pycma's default constants for a dimension and a population (tutorial, Table 1).
-
-    The population may be traced if a static `capacity` bounds it: weights behind it are 0.
-    """
-    d, size = dim, jnp.asarray(population, float)
-    rank = jnp.arange(1, (population if capacity is None else capacity) + 1)
-    raw = jnp.where(rank <= size, jnp.log((size + 1) / 2) - jnp.log(rank), 0)  # Eq. 49
-    positive, negative = jnp.maximum(raw, 0), jnp.minimum(raw, 0)
-    mu_eff = positive.sum() ** 2 / (positive**2).sum()
-    mu_eff_negative = negative.sum() ** 2 / (negative**2).sum()
-
-    c_1 = jnp.minimum(1, size / 6) * 2 / ((d + 1.3) ** 2 + mu_eff)
-    c_mu = 2 * (0.25 + mu_eff + 1 / mu_eff - 2) / ((d + 2) ** 2 + mu_eff)
-    c_mu = jnp.minimum(1 - c_1, c_mu)
-    c_sigma = jnp.minimum(0.5, (mu_eff + 2) / (d + mu_eff + 3))
-
-    # Negative weights: no decay of C, a rate that fits their number, positive definite (50 - 53).
-    negative_sum = jnp.minimum(
-        jnp.minimum(1 + c_1 / c_mu, 1 + 2 * mu_eff_negative / (mu_eff + 2)),
-        (1 - c_1 - c_mu) / (c_mu * d),
-    )
-    # pycma's own term: it damps large populations, up to three times as hard in many dimensions.
-    many = max(1, 3 * (1 - 0.5 ** (d / 9))) * jnp.sqrt((mu_eff - 1) / (d + 1))
-    return Constants(
-        weights=positive / positive.sum() - negative_sum * negative / negative.sum(),
-        mu_eff=mu_eff,
-        c_sigma=c_sigma,
-        damping=1 + 2 * jnp.maximum(0, many - 1) + c_sigma,
-        c_c=(4 + mu_eff / d) / (d + 4 + 2 * mu_eff / d),
-        c_1=c_1,
-        c_mu=c_mu,
-        eigen_gap=jnp.ceil(1 / ((c_1 + c_mu) * d * 10)).astype(jnp.int32),
-    )
-
-
-def start(first: Candidate, sigma0: Float[Array, ""] | float, dim: int, population: int) -> State:
-    """The distribution N(first point, sigma0^2 I) before the first generation."""
-    point = first.point
+def start(
+    point: Float[Array, " d"],
+    sigma0: Float[Array, ""] | float,
+    dim: int,
+    population: int,
+    loss: Float[Array, ""],
+) -> CmaState:
+    """`cma_start` of a search that was built for `dim` numbers."""
     if point.shape != (dim,):
         raise ValueError(
             f"The point has shape {point.shape}; this search was built for ({dim},)."
             " Batch with jax.vmap."
         )
     identity, zero = jnp.eye(dim, dtype=point.dtype), jnp.zeros_like(point)
-    return State(
+    return CmaState(
         mean=point,
-        best=first._replace(loss=finite_or_inf(first.loss)),
+        best=Candidate(point, finite_or_inf(loss)),
         stop=jnp.int32(StopReason.RUNNING),
         sigma=jnp.asarray(sigma0, point.dtype),
         covariance=identity,
@@ -174,12 +140,12 @@ def start(first: Candidate, sigma0: Float[Array, ""] | float, dim: int, populati
     )
 
 
-def started(state: State) -> tuple[State, Trace]:
+def started(state: CmaState) -> tuple[CmaState, Trace]:
     """A state that has evaluated one point, with its trace."""
     return state, start_trace(state.best, distribution(state))
 
 
-def distribution(state: State) -> Distribution:
+def distribution(state: CmaState) -> Distribution:
     """What a reader plots of the distribution."""
     return Distribution(
         sigma=state.sigma,
@@ -188,31 +154,64 @@ def distribution(state: State) -> Distribution:
     )
 
 
+def move(
+    state: CmaState,
+    points: Float[Array, "capacity d"],
+    losses: Float[Array, " capacity"],
+    rates: Constants,
+    sigma0: Float[Array, ""] | float,
+    population: int | Int[Array, ""],
+    tolerances: Tolerances,
+) -> CmaState:
+    """One generation: `cma_tell`, then the stop criteria."""
+    state = cma_tell(state, points, losses, rates)
+    return stopping.check(state, losses, sigma0, population, tolerances)
+
+
 @jax.default_matmul_precision("highest")  # on GPU the default drops most of the mantissa
-def ask(key: Array, state: State, number: int) -> Float[Array, "{number} d"]:
+def cma_ask(key: Array, state: CmaState, number: int) -> Float[Array, "{number} d"]:
     """Sample candidates, x = m + sigma C^(1/2) z (Eqs. 38 - 40).
 
     The tutorial samples B D z, which has the same distribution, but B is arbitrary where
     eigenvalues are equal; the symmetric root lets equal keys give equal points in any batch.
+
+    Args:
+        key: Random key of this generation.
+        state: The distribution.
+        number: How many candidates to draw; static under `jax.jit`.
+
+    Returns:
+        The candidates.
     """
     z = jax.random.normal(key, (number, len(state.mean)), state.mean.dtype)
     return state.mean + state.sigma * (z @ state.basis * state.scales) @ state.basis.T
 
 
 @jax.default_matmul_precision("highest")
-def tell(
-    state: State,
+def cma_tell(
+    state: CmaState,
     points: Float[Array, "capacity d"],
     losses: Float[Array, " capacity"],
-    constants: Constants,
-) -> State:
+    rates: Constants | None = None,
+) -> CmaState:
     """Move the distribution towards the better candidates (tutorial, Eqs. 41 - 47).
 
     Only the order of the losses matters. Equal losses keep the order of the candidates, so that
     a flat objective is random selection, under which the step size stays unbiased; NaN and
-    infinite losses rank last. The points need not come from `ask`.
+    infinite losses rank last.
+
+    Args:
+        state: The distribution before.
+        points: One generation, three candidates or more. They need not come from `cma_ask`.
+        losses: Their losses.
+        rates: Weights and learning rates; None for pycma's own (`jaxshape.search.cma.constants`).
+
+    Returns:
+        The distribution after.
     """
-    c, dim = constants, len(state.mean)
+    if rates is None:
+        rates = constants(len(state.mean), len(points), dtype=state.mean.dtype)
+    c, dim = rates, len(state.mean)
     weights = c.weights
     generation = state.generation + 1
 
@@ -265,12 +264,12 @@ def _expected_norm(dim: int) -> float:
     return math.sqrt(2) * math.exp(math.lgamma((dim + 1) / 2) - math.lgamma(dim / 2))
 
 
-def _sphere(state: State, steps: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+def _sphere(state: CmaState, steps: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
     """D^-1 B^T y: steps in units of the current distribution, along its axes."""
     return steps @ state.basis / state.scales
 
 
-def _balanced(state: State) -> State:
+def _balanced(state: CmaState) -> CmaState:
     """The same distribution, its scale moved from C into sigma before C under- or overflows.
 
     A run without stopping can go that far: large populations shrink C instead of sigma.

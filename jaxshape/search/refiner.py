@@ -18,8 +18,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-# The loss of one point; a refiner calls it under `jax.vmap` or `jax.grad`. A point that is not
-# finite costs nothing and has the loss NaN.
+from jaxshape.search.batching import select
+
+# The loss of one point, in the point's own type; a refiner calls it under `jax.vmap` or `jax.grad`.
+# A point that is not finite costs nothing and has the loss NaN.
 Objective = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 
@@ -42,48 +44,65 @@ class StopReason(IntEnum):
 
 
 class Candidate(NamedTuple):
-    """A point together with its loss as it was evaluated."""
+    """A point together with its loss as it was evaluated.
+
+    Attributes:
+        point: Coordinates in the search space.
+        loss: Its loss; +inf where it failed or was not evaluated.
+    """
 
     point: Float[Array, " d"]
     loss: Float[Array, ""]
 
 
 class Distribution(NamedTuple):
-    """The normal distribution that a population is drawn from."""
+    """The normal distribution that a population is drawn from.
+
+    Attributes:
+        sigma: Step size, the scale that all axes share.
+        standard_deviations: Standard deviation of each coordinate.
+        axis_lengths: Standard deviations along the principal axes, ascending: the eigen-spectrum,
+            with sigma.
+    """
 
     sigma: Float[Array, ""]
-    """Step size, the scale that all axes share."""
     standard_deviations: Float[Array, " d"]
-    """Of each coordinate."""
     axis_lengths: Float[Array, " d"]
-    """Standard deviations along the principal axes, ascending: the eigen-spectrum, with sigma."""
 
 
 class Trace(NamedTuple):
-    """What a reader plots of one iteration."""
+    """What a reader plots of one iteration.
+
+    Attributes:
+        best_loss: Lowest loss so far, the start included; never rises.
+        loss: Lowest finite loss of this iteration's candidates; +inf where all failed.
+        spread: Standard deviation of the candidates, rms over the coordinates.
+        evaluations: Objectives evaluated so far, the start included.
+        distribution: What candidates are drawn from; None for searches that draw from none.
+    """
 
     best_loss: Float[Array, ""]
-    """Lowest loss so far, the start included; never rises."""
     loss: Float[Array, ""]
-    """Lowest finite loss of this iteration's candidates; else +inf."""
     spread: Float[Array, ""]
-    """Standard deviation of the candidates, rms over the coordinates."""
     evaluations: Int[Array, ""]
-    """Objectives evaluated so far, the start included."""
     distribution: Distribution | None = None
-    """For searches that draw from one."""
 
 
 class Refiner(NamedTuple):
-    """A search over one point; every state has `best` (a `Candidate`), `mean` and `stop`.
+    """A search over one point; batch it with `jax.vmap`.
 
-    `init(key, point, loss)` takes the loss of the first point, so that `best` is never worse than
-    the start and no iteration spends an evaluation on it. `step(key, state, objective)` is one
-    iteration. `mean` is where the search stands: the centre of the distribution it samples, or the
-    current iterate of a gradient method, whose loss may not have been evaluated. `stop` is a
-    `StopReason`; a search without criteria of its own leaves it at RUNNING. `resume(key, state,
-    loss)` starts again from the state of an earlier search whose objective has changed since, where
-    `loss` is that of `state.best.point` now; without it, `init` at that point takes its place.
+    Every state has `best` (a `Candidate`), `mean` and `stop`. `mean` is where the search stands:
+    the centre of the distribution it samples, or the current iterate of a gradient method, whose
+    loss may not have been evaluated. `stop` is a `StopReason`; a search without criteria of its
+    own leaves it at RUNNING. Numbers have the type of the point, counters are int32.
+
+    Attributes:
+        init: `(key, point, loss) -> state, trace`. It takes the loss of the first point, so that
+            `best` is never worse than the start and no iteration spends an evaluation on it.
+        step: `(key, state, objective) -> state, trace`, one iteration.
+        resume: `(key, state, loss) -> state, trace`, which starts again from the state of an
+            earlier search whose objective has changed since; `loss` is that of `state.best.point`
+            now. Without it, `init` at that point takes its place.
     """
 
     init: Callable[..., tuple[Any, Trace]]
@@ -91,15 +110,52 @@ class Refiner(NamedTuple):
     resume: Callable[..., tuple[Any, Trace]] | None = None
 
 
+def advance(
+    refiner: Refiner, key: Array, state: Any, trace: Trace, objective: Objective
+) -> tuple[Any, Trace]:
+    """One iteration of a search that may have stopped, for loops over a batch.
+
+    Args:
+        refiner: The search.
+        key: Random key of this iteration.
+        state: The search's state.
+        trace: Of the iteration before.
+        objective: The loss of one point. A search that has stopped asks for points that are not
+            finite.
+
+    Returns:
+        State and trace after the iteration; the same as before where the search has stopped.
+    """
+    running = state.stop == StopReason.RUNNING
+    awake = lambda point: objective(jnp.where(running, point, jnp.nan))  # noqa: E731
+    return select(running, refiner.step(key, state, awake), (state, trace))
+
+
 def finite_or_inf(losses: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Losses with NaN and both infinities set to +inf: a failed evaluation ranks last."""
+    """Rank failed evaluations last.
+
+    Args:
+        losses: Any numbers.
+
+    Returns:
+        The losses, with +inf for NaN and for both infinities.
+    """
     return jnp.where(jnp.isfinite(losses), losses, jnp.inf)
 
 
 def keep_better(
     best: Candidate, points: Float[Array, "n d"], losses: Float[Array, " n"]
 ) -> Candidate:
-    """The best candidate so far; ties and failed evaluations keep the earlier one."""
+    """The best candidate so far; ties and failed evaluations keep the earlier one.
+
+    Args:
+        best: The best candidate before.
+        points: What was evaluated since.
+        losses: Their losses, in any order; NaN and infinite ones are failed evaluations.
+
+    Returns:
+        `best`, or the first of the points with the lowest loss where that is lower.
+    """
     losses = finite_or_inf(losses)
     winner = jnp.argmin(losses)
     improved = losses[winner] < best.loss
@@ -110,7 +166,15 @@ def keep_better(
 
 
 def start_trace(first: Candidate, distribution: Distribution | None = None) -> Trace:
-    """The trace of a search that has evaluated its first point only."""
+    """The trace of a search that has evaluated its first point only.
+
+    Args:
+        first: The first point and its loss.
+        distribution: What candidates will be drawn from, in searches that have one.
+
+    Returns:
+        A trace with one evaluation and no spread.
+    """
     loss = finite_or_inf(first.loss)
     return Trace(loss, loss, jnp.zeros_like(loss), jnp.int32(1), distribution)
 
@@ -122,7 +186,18 @@ def summarise(
     evaluations: Int[Array, ""],
     distribution: Distribution | None = None,
 ) -> Trace:
-    """The trace of one iteration that evaluated `points`; `best` includes them already."""
+    """The trace of one iteration.
+
+    Args:
+        best: The best candidate so far, those of this iteration included.
+        points: Candidates of this iteration.
+        losses: Their losses.
+        evaluations: Objectives evaluated so far, the start included.
+        distribution: What candidates are drawn from now, in searches that have one.
+
+    Returns:
+        The trace.
+    """
     return Trace(
         best_loss=best.loss,
         loss=jnp.min(finite_or_inf(losses)),

@@ -17,8 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.search import cma, stopping
+from jaxshape.checks import one_of, whole
+from jaxshape.search import cma
 from jaxshape.search.batching import apply_if, select
+from jaxshape.search.rates import constants
 from jaxshape.search.refiner import (
     Candidate,
     Objective,
@@ -42,14 +44,14 @@ class Run(NamedTuple):
     allowed: Int[Array, ""]  # iterations
 
 
-class State(NamedTuple):
+class RestartState(NamedTuple):
     """The run that is under way, the generation it collects, and what came before."""
 
     mean: Float[Array, " d"]
     best: Candidate  # of all runs
     stop: Int[Array, ""]
     first: Candidate  # where the first run began
-    search: cma.State
+    search: cma.CmaState
     points: Float[Array, "capacity d"]  # of the generation that is being collected
     losses: Float[Array, " capacity"]
     run: Run
@@ -70,20 +72,37 @@ def with_restarts(
     restart_point: Callable[[Array, Float[Array, " d"]], Float[Array, " d"]] | None = None,
     tolerances: Tolerances = Tolerances(),
 ) -> Refiner:
-    """CMA-ES with restarts; `population` candidates per iteration, whatever the population.
+    """CMA-ES with restarts; the same number of candidates per iteration, whatever the population.
 
-    A run after `doublings` doublings ends the search when it stops. `restart_point(key, first)`
-    draws the mean of a new run; without it, every run begins at the first point.
+    Args:
+        kind: "ipop", which doubles the population at each restart, or "bipop", which spends as
+            many evaluations on short runs with small populations.
+        dim: Numbers in a point, 1 or more.
+        sigma0: First standard deviation, above 0, in units of the search space.
+        population: Candidates per iteration and population of the first run, 3 or more; None for
+            pycma's 4 + floor(3 ln dim).
+        doublings: Doublings of the population, 0 or more. A run after the last of them ends the
+            search when it stops.
+        restart_point: Draws the mean of a new run from a key and the first point; without it,
+            every run begins at the first point.
+        tolerances: When a run is over.
+
+    Returns:
+        The search.
+
+    Raises:
+        ValueError: A setting is outside its range.
     """
-    size = cma.default_population(dim) if population is None else population
-    cma.require_settings(sigma0, size)
-    if doublings < 0:
-        raise ValueError(f"doublings is {doublings}; give 0 or more.")
+    one_of("kind", kind, ("ipop", "bipop"))
+    size = cma.checked_population(dim, sigma0, population)
+    whole("doublings", doublings, 0)
     capacity = size * 2**doublings
     unlimited = jnp.iinfo(jnp.int32).max
 
-    def init(key: Array, point: Float[Array, " d"], loss: Float[Array, ""]) -> tuple[State, Trace]:
-        search, trace = cma.started(cma.start(Candidate(point, loss), sigma0, dim, size))
+    def init(
+        key: Array, point: Float[Array, " d"], loss: Float[Array, ""]
+    ) -> tuple[RestartState, Trace]:
+        search, trace = cma.started(cma.start(point, sigma0, dim, size, loss))
         zero = jnp.int32(0)
         run = Run(
             multiple=jnp.int32(1),
@@ -92,7 +111,7 @@ def with_restarts(
             iterations=zero,
             allowed=jnp.int32(unlimited),
         )
-        state = State(
+        state = RestartState(
             mean=search.mean,
             best=search.best,
             stop=search.stop,
@@ -109,9 +128,9 @@ def with_restarts(
         )
         return state, trace
 
-    def step(key: Array, state: State, objective: Objective) -> tuple[State, Trace]:
+    def step(key: Array, state: RestartState, objective: Objective) -> tuple[RestartState, Trace]:
         ask_key, restart_key = jax.random.split(key)
-        points = cma.ask(ask_key, state.search, size)
+        points = cma.cma_ask(ask_key, state.search, size)
         losses = jax.vmap(objective)(points)
         state = _collect(state, points, losses, size)
         run = state.run
@@ -130,12 +149,11 @@ def with_restarts(
     def move(search, points, losses, run):
         """One generation of the whole population."""
         population = size * run.multiple
-        constants = cma.constants(dim, population, capacity)
-        search = cma.tell(search, points, losses, constants)
-        search = stopping.check(search, losses, run.sigma0, population, tolerances)
+        rates = constants(dim, population, capacity, points.dtype)
+        search = cma.move(search, points, losses, rates, run.sigma0, population, tolerances)
         return search, points, losses, run
 
-    def begin_again(key: Array, state: State) -> State:
+    def begin_again(key: Array, state: RestartState) -> RestartState:
         """The state at the start of the next run."""
         point_key, size_key, step_key = jax.random.split(key, 3)
         run = state.run
@@ -159,7 +177,7 @@ def with_restarts(
         point = first if restart_point is None else restart_point(point_key, first)
         unknown = jnp.full_like(state.best.loss, jnp.inf)
         return state._replace(
-            search=cma.start(Candidate(point, unknown), run.sigma0, dim, size),
+            search=cma.start(point, run.sigma0, dim, size, unknown),
             losses=jnp.full_like(state.losses, jnp.inf),  # those of a larger population
             mean=point,
             run=run,
@@ -174,8 +192,8 @@ def with_restarts(
 
 
 def _collect(
-    state: State, points: Float[Array, "n d"], losses: Float[Array, " n"], size: int
-) -> State:
+    state: RestartState, points: Float[Array, "n d"], losses: Float[Array, " n"], size: int
+) -> RestartState:
     """The state with the candidates of one more iteration in its generation."""
     run = state.run
     first = (run.iterations % run.multiple) * size

@@ -6,13 +6,15 @@ in float32 an absolute `tolfun` of 1e-11 would never be met by losses near 1.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxshape.checks import one_of, within
 from jaxshape.search.batching import apply_if
+from jaxshape.search.config import is_array
 from jaxshape.search.refiner import StopReason, finite_or_inf
 
 RECORD_EVERY = 5
@@ -21,28 +23,45 @@ RECORD_EVERY = 5
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Thresholds of the criteria; 0 (or infinity for those that are upper limits) turns one off."""
+    """Thresholds of the criteria; 0 (or infinity for those that are upper limits) turns one off.
+
+    Attributes:
+        tolfun: Range of the losses of a generation and of the best losses of recent ones.
+        tolfunhist: Range of the best losses of recent generations.
+        tolx: Standard deviation of every coordinate.
+        tolxstagnation: Distance the mean moves over 20 generations and a tenth of all.
+        tolstagnation: Whether to end after 100 + 100 d^1.5 / population generations without
+            falling medians.
+        tolfacupx: Growth of a coordinate's standard deviation over sigma0; an upper limit.
+        tolupsigma: Growth of sigma over sigma0 and over the longest axis; an upper limit.
+        tolconditioncov: Condition number of the covariance; an upper limit.
+        tolflatfitness: Generations in a row of which three quarters of the losses are equal; an
+            upper limit.
+        noeffect: Whether to end where a step no longer changes the mean.
+
+    Raises:
+        ValueError: A threshold is negative or no number. Arrays of JAX, which may be traced, are
+            not checked.
+    """
 
     tolfun: float = 1e-11
-    """Range of the losses of a generation and of the best of recent ones."""
     tolfunhist: float = 1e-12
-    """Range of the best losses of recent generations."""
     tolx: float = 1e-11
-    """Standard deviation of every coordinate."""
     tolxstagnation: float = 1e-9
-    """Distance the mean moves over 20 generations and a tenth of all."""
     tolstagnation: bool = True
-    """Whether to end after 100 + 100 d^1.5 / population generations without falling medians."""
     tolfacupx: float = 1e3
-    """Growth of a coordinate's standard deviation over sigma0."""
     tolupsigma: float = 1e20
-    """Growth of sigma over sigma0 and over the longest axis."""
     tolconditioncov: float = 1e14
-    """Condition number of the covariance."""
     tolflatfitness: float = 1.0
-    """Generations in a row of which three quarters of the losses are equal."""
     noeffect: bool = True
-    """Whether to end where a step no longer changes the mean."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type is bool:
+                one_of(field.name, value, (True, False))
+            elif not is_array(value):
+                within(field.name, value, 0, math.inf)
 
 
 class History(NamedTuple):

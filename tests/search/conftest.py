@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import pytest
 
 from jaxshape.search import objective as objective_module
@@ -48,3 +49,9 @@ def decoder(compile_quickly):
         patch.setattr(run_module, "prepare_decoder", lambda params: params)
         patch.setattr(objective_module, "CANDIDATES_AT_A_TIME", {"cpu": 1, "default": 1})
         yield counted
+
+
+@pytest.fixture
+def unchecked_types(monkeypatch):
+    """Types are not checked while a test runs, as in a user's program."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

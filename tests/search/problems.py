@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxshape.search.refiner import StopReason
+from jaxshape.search.refiner import advance
 from jaxshape.search.stopping import Tolerances
 
 NEVER = Tolerances(
@@ -50,18 +50,11 @@ def rastrigin(x):
     return jnp.sum(x**2 + 10 * (1 - jnp.cos(2 * jnp.pi * x)))
 
 
-def advance(refiner, objective, key, state, trace):
-    """One iteration; nothing where the search has stopped, as in `jaxshape.search.run`."""
-    running = state.stop == StopReason.RUNNING
-    moved = refiner.step(key, state, objective)
-    return jax.tree.map(lambda new, old: jnp.where(running, new, old), moved, (state, trace))
-
-
 def run(refiner, objective, key, code, iterations):
     """One search over one code: the final state, and the trace over the iterations."""
 
     def body(now, key):
-        state, trace = advance(refiner, objective, key, *now)
+        state, trace = advance(refiner, key, *now, objective)
         return (state, trace), trace
 
     init_key, loop_key = jax.random.split(key)

@@ -1,6 +1,8 @@
 """CMA-ES: pycma and cmaes as oracles, invariances, hostile losses, batches."""
 
+import doctest
 import functools
+import sys
 
 import cma as pycma
 import cmaes
@@ -20,15 +22,17 @@ from problems import (  # noqa: F401
 )
 
 from jaxshape.search import stopping
-from jaxshape.search.cma import ask, cma, constants, default_population, start, tell
-from jaxshape.search.refiner import Candidate, StopReason
+from jaxshape.search.cma import cma_ask, cma_start, cma_tell
+from jaxshape.search.methods.cma import cma
+from jaxshape.search.rates import constants, default_population
+from jaxshape.search.refiner import StopReason
 from jaxshape.search.stopping import Tolerances
 
 KEY = jax.random.key(0)
 
 
 def start_at(point, sigma0=0.5, population=8):
-    return start(Candidate(point, jnp.asarray(jnp.inf)), sigma0, len(point), population)
+    return cma_start(point, sigma0, population=population)
 
 
 def assert_sound(state):
@@ -71,14 +75,13 @@ def pycma_run(dim, population, seed=3):
 
 def told(points, losses, rates=None):
     """What `tell` makes of those generations, after each."""
-    population, dim = points.shape[-2:]
 
     def body(state, generation):
-        state = tell(state, *generation, constants(dim, population) if rates is None else rates)
+        state = cma_tell(state, *generation, rates)
         numbers = state.mean, state.sigma, state.covariance, state.path_sigma, state.path_c
         return state, (*numbers, state.best.point, state.scales)
 
-    first = start_at(jnp.ones(dim, points.dtype), population=population)
+    first = start_at(jnp.ones_like(points[0, 0]), population=points.shape[1])
     return jax.lax.scan(body, first, (points, losses))[1]
 
 
@@ -170,7 +173,7 @@ def test_follows_cmaes_given_its_constants():
         )
         # Where h_sigma corrects for the age of the path, cmaes counts one generation more.
         state = start_at(jnp.ones(dim))._replace(generation=jnp.int32(1))
-        next_state = jax.jit(tell)
+        next_state = jax.jit(cma_tell)
         for _ in range(30):
             points = [oracle.ask() for _ in range(population)]
             losses = [float(np.sum(np.logspace(0, 3, dim) * x**2)) for x in points]
@@ -189,7 +192,7 @@ def test_samples_have_the_stated_mean_and_covariance():
     covariance = np.array([[4.0, 1.0], [1.0, 0.5]], np.float32)
     values, basis = np.linalg.eigh(covariance)
     state = start_at(jnp.array([3.0, -1.0]), sigma0=0.1)
-    points = ask(KEY, state._replace(basis=basis, scales=np.sqrt(values)), 100_000)
+    points = cma_ask(KEY, state._replace(basis=basis, scales=np.sqrt(values)), 100_000)
     np.testing.assert_allclose(points.mean(axis=0), [3, -1], atol=3e-3)
     np.testing.assert_allclose(np.cov(points.T), 0.01 * covariance, atol=1e-3)
 
@@ -204,10 +207,10 @@ def test_the_search_does_not_depend_on_shift_rotation_and_scale():
         states = states._replace(sigma=jnp.array([scale, 1.0]))
 
         def body(states, key):
-            units = ask(key, jax.tree.map(lambda x: x[1], states), 9)
+            units = cma_ask(key, jax.tree.map(lambda x: x[1], states), 9)
             points = scale * units @ rotation.T + shift
             losses = jax.vmap(rosenbrock)(points)
-            both = jax.vmap(tell, (0, 0, None, None))(
+            both = jax.vmap(cma_tell, (0, 0, None, None))(
                 states, jnp.stack([points, units]), losses, constants(dim, 9)
             )
             return both, None
@@ -222,8 +225,8 @@ def test_the_search_does_not_depend_on_shift_rotation_and_scale():
 
 def test_only_the_order_of_losses_matters_and_failures_rank_last():
     state = start_at(jnp.zeros(3))
-    points = ask(KEY, state, 6)
-    next_state = jax.jit(tell)
+    points = cma_ask(KEY, state, 6)
+    next_state = jax.jit(cma_tell)
 
     def mean_after(*losses):
         return np.asarray(next_state(state, points, jnp.array(losses), constants(3, 6)).mean)
@@ -260,7 +263,7 @@ def generations_of_given_losses(population):
 
     def body(state, key_and_losses):
         key, losses = key_and_losses
-        state = tell(state, ask(key, state, population), losses, constants(4, population))
+        state = cma_tell(state, cma_ask(key, state, population), losses, constants(4, population))
         state = stopping.check(state, losses, 0.5, population, Tolerances())
         return state, state.best.loss
 
@@ -345,9 +348,9 @@ def test_scales_far_from_one():
 def test_covariance_stays_positive_definite_in_float32_over_500_generations():
 
     def body(state, key):
-        points = ask(key, state, 10)
+        points = cma_ask(key, state, 10)
         losses = jnp.sum(points**2 * jnp.logspace(0, 10, 10), axis=1)
-        state = tell(state, points, losses, constants(10, 10))
+        state = cma_tell(state, points, losses, constants(10, 10))
         return state, (state.covariance, state.scales)
 
     keys = jax.random.split(KEY, 500)
@@ -361,6 +364,11 @@ def test_covariance_stays_positive_definite_in_float32_over_500_generations():
 
 
 # --- the refiner ------------------------------------------------------------------------------
+
+
+def test_the_examples_of_ask_and_tell_run():
+    found = doctest.testmod(sys.modules["jaxshape.search.cma"])
+    assert found.attempted == 6 and not found.failed
 
 
 def test_converges():
@@ -452,7 +460,7 @@ def test_a_batch_decomposes_only_when_due():
     rates = constants(100, 17)
     assert rates.eigen_gap == 2
     states = jax.vmap(start_at)(jnp.ones((4, 100)))
-    jaxpr = jax.make_jaxpr(jax.vmap(lambda *given: tell(*given, rates)))(
+    jaxpr = jax.make_jaxpr(jax.vmap(lambda *given: cma_tell(*given, rates)))(
         states, jnp.ones((4, 17, 100)), jnp.ones((4, 17))
     )
 
@@ -470,13 +478,14 @@ def test_a_batch_decomposes_only_when_due():
 @pytest.mark.parametrize(
     "changed, message",
     [
-        ({"population": 1}, "population is 1; CMA-ES ranks candidates, so give 3 or more"),
-        ({"population": 2}, "give 3 or more"),
-        ({"sigma0": 0.0}, "above 0"),
+        ({"population": 1}, "population is 1; give a whole number, 3 or more"),
+        ({"population": 2.5}, "population is 2.5; give a whole number, 3 or more"),
+        ({"sigma0": 0.0}, "sigma0 is 0.0; give a number above 0"),
         ({"sigma0": float("nan")}, "above 0"),
+        ({"dim": 0}, "dim is 0; give a whole number, 1 or more"),
     ],
 )
-def test_bad_settings_say_what_to_do(changed, message):
+def test_bad_settings_say_what_to_do(unchecked_types, changed, message):
     with pytest.raises(ValueError, match=message):
         cma(**{"dim": 3, "sigma0": 0.3} | changed)
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from problems import quick_compilation, rastrigin, sphere  # noqa: F401
 
-from jaxshape.search.cma import constants, tell
+from jaxshape.search.cma import cma_tell
+from jaxshape.search.rates import constants
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.restarts import with_restarts
 
@@ -63,7 +64,7 @@ def test_collecting_iterations_is_one_generation_of_a_population_as_large():
         points, losses = state.points[:number], state.losses[:number]
         assert len(np.unique(points, axis=0)) == number
         np.testing.assert_allclose(losses, jax.vmap(sphere)(points))
-        expected = jax.jit(tell)(first, points, losses, constants(DIM, number))
+        expected = jax.jit(cma_tell)(first, points, losses, constants(DIM, number))
         assert trace.evaluations == 1 + number and state.search.generation == 1
         for name in ("mean", "sigma", "covariance", "path_sigma", "path_c"):
             ours, theirs = getattr(state.search, name), getattr(expected, name)
@@ -203,8 +204,10 @@ def test_a_restart_may_draw_its_own_first_point(flat):
         assert np.all(states.mean > 8) and len(np.unique(states.mean, axis=0)) == 16
 
 
-def test_bad_settings_say_what_to_do():
-    with pytest.raises(ValueError, match="doublings is -1; give 0 or more"):
+def test_bad_settings_say_what_to_do(unchecked_types):
+    with pytest.raises(ValueError, match="kind is 'ipop '; give 'ipop' or 'bipop'"):
+        with_restarts("ipop ", dim=3, sigma0=0.3)
+    with pytest.raises(ValueError, match="doublings is -1; give a whole number, 0 or more"):
         with_restarts("ipop", dim=3, sigma0=0.3, doublings=-1)
     with pytest.raises(ValueError, match="population is 2"):
         with_restarts("ipop", dim=3, sigma0=0.3, population=2)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from problems import (  # noqa: F401
     NEVER,
-    advance,
     ellipsoid,
     quick_compilation,
     rosenbrock,
@@ -18,8 +17,10 @@ from problems import (  # noqa: F401
 )
 
 from jaxshape.search import stopping
-from jaxshape.search.cma import cma, constants, start, tell
-from jaxshape.search.refiner import Candidate, StopReason
+from jaxshape.search.cma import cma_start, cma_tell
+from jaxshape.search.methods.cma import cma
+from jaxshape.search.rates import constants
+from jaxshape.search.refiner import StopReason, advance
 from jaxshape.search.stopping import Tolerances
 
 KEY = jax.random.key(0)
@@ -77,11 +78,11 @@ def stops(tolerances):
         rates = constants(DIM, POPULATION)
 
         def body(state, generation):
-            state = tell(state, *generation, rates)
+            state = cma_tell(state, *generation, rates)
             state = stopping.check(state, generation[1], sigma0, POPULATION, tolerances)
             return state, state.stop
 
-        state = start(Candidate(first, jnp.asarray(jnp.inf)), sigma0, DIM, POPULATION)
+        state = cma_start(first, sigma0, population=POPULATION)
         return jax.lax.scan(body, state, (points, losses))[1]
 
     return jax.jit(reasons)
@@ -143,7 +144,7 @@ def searches(tolerances):
             return 1 + jax.lax.switch(which, FUNCTIONS, x)
 
         def body(now, key):
-            now = advance(refiner, objective, key, *now)
+            now = advance(refiner, key, *now, objective)
             return now, now
 
         started = refiner.init(key, code, objective(code))
@@ -172,3 +173,16 @@ def test_stopping_costs_no_quality():
     np.testing.assert_allclose(
         stopped.best.loss[:, -1], endless.best.loss[:, -1], rtol=4 * np.finfo(np.float32).eps
     )
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        ({"tolfun": -1e-9}, "tolfun is -1e-09; give a number from 0 to inf"),
+        ({"tolupsigma": float("nan")}, "tolupsigma is nan; give a number from 0"),
+        ({"noeffect": "no"}, "noeffect is 'no'; give True or False"),
+    ],
+)
+def test_thresholds_outside_their_range_are_refused(unchecked_types, changed, message):
+    with pytest.raises(ValueError, match=message):
+        Tolerances(**changed)

@@ -1,29 +1,37 @@
-"""Searches by name, `family` or `family:variant`; a family is a module of this folder.
+"""Searches by name; `names.py` says which names there are.
 
-A module offers `build(variant, dim, config)`, which gives a `Refiner` over points of `dim` numbers
-with the settings of a `RefineConfig`, and raises `ValueError` for a variant it does not know. That
-is all: the module's name is the method's name everywhere, the command line included.
+A module of this folder is a family of searches: its name is the method's name everywhere, the
+command line included, and its `build(variant, dim, config)` gives the search. Functions of other
+packages go by their import path or by an entry point.
 """
 
-import importlib
-import pkgutil
-
 from jaxshape.search.config import RefineConfig
+from jaxshape.search.names import find_build
 from jaxshape.search.refiner import Refiner
 
 
-def families() -> list[str]:
-    """The modules of this folder."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
-
-
 def build_refiner(name: str, dim: int, config: RefineConfig) -> Refiner:
-    """The search of that name; `ValueError` where there is none."""
-    family, _, variant = name.partition(":")
-    if family not in families():
+    """The search of that name.
+
+    Args:
+        name: `family` or `family:variant`, as in "cma", "cma:ipop" and "gradient:adam", or
+            `package.module:function`, the import path of a function that is given
+            `(variant, dim, config)`.
+        dim: Numbers in a point of the search space, 1 or more.
+        config: Settings of the search.
+
+    Returns:
+        The search.
+
+    Raises:
+        ValueError: There is no such search, it refuses its settings, or the function cannot be
+            imported or returns something else.
+    """
+    build, variant = find_build(name)
+    refiner = build(variant, dim, config)
+    if not isinstance(refiner, Refiner):
         raise ValueError(
-            f"There is no method {name!r}; choose from {', '.join(families())}, or 'encoder' for"
-            " no search at all. Some have variants: cma:ipop, gradient:adam, evosax:Sep_CMA_ES."
+            f"The method {name!r} returned {type(refiner).__name__}; it must return a"
+            " jaxshape.Refiner."
         )
-    module = importlib.import_module(f"{__name__}.{family}")
-    return module.build(variant or None, dim, config)
+    return refiner

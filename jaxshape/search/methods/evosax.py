@@ -1,13 +1,19 @@
-"""The distribution-based strategies of evosax, for comparison: `evosax:Sep_CMA_ES`, ..."""
+"""The distribution-based strategies of evosax, for comparison: `evosax:Sep_CMA_ES`, ...
+
+`evosax:Open_ES@18` has a population of its own, whatever the settings say.
+"""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from evosax.algorithms.distribution_based import distribution_based_algorithms
 from jaxtyping import Array, Float, Int
 
-from jaxshape.search.config import RefineConfig
+from jaxshape.checks import positive, whole
+from jaxshape.search.batching import cast_like
+from jaxshape.search.config import RefineConfig, is_array
 from jaxshape.search.refiner import (
     Candidate,
     Objective,
@@ -19,8 +25,33 @@ from jaxshape.search.refiner import (
     summarise,
 )
 
+LEARNING_RATE = 0.3
+"""Learning rate of the strategies that follow an estimated gradient, in units of sigma0: Adam takes
+the place of their own optimisers, whose 0.001 to 0.01 hardly move."""
 
-class State(NamedTuple):
+FOLLOW_A_GRADIENT = {
+    "ARS",
+    "ASEBO",
+    "ESMC",
+    "GuidedES",
+    "NoiseReuseES",
+    "Open_ES",
+    "PGPE",
+    "PersistentES",
+    "SV_Open_ES",
+}
+
+SEVERAL_POPULATIONS = {"SV_CMA_ES", "SV_Open_ES"}
+"""Strategies that divide the candidates between two populations."""
+
+MULTIPLES = (
+    dict.fromkeys(FOLLOW_A_GRADIENT | {"CR_FM_NES", "SV_CMA_ES"}, 2)  # mirrored candidates
+    | {"SV_Open_ES": 4}
+)
+"""What the population of a strategy is a multiple of."""
+
+
+class EvosaxState(NamedTuple):
     """The strategy's own state, and where it lies in the search space."""
 
     mean: Float[Array, " d"]
@@ -32,10 +63,19 @@ class State(NamedTuple):
 
 
 def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
-    """The strategy that the variant names."""
-    return evosax_strategy(
-        variant or "", dim=dim, population=config.population, sigma0=config.sigma0
-    )
+    """The strategy that the variant names, `NAME` or `NAME@POPULATION`.
+
+    Without a population of its own it has that of the settings, or the next one up that it takes:
+    some want an even one.
+    """
+    name, at, number = (variant or "").partition("@")
+    if not at:
+        population = -(-config.population // MULTIPLES.get(name, 1)) * MULTIPLES.get(name, 1)
+    elif number.isdecimal():
+        population = int(number)
+    else:
+        raise ValueError(f"evosax:{variant} has no population behind the @; give a whole number.")
+    return evosax_strategy(name, dim=dim, population=population, sigma0=config.sigma0)
 
 
 def evosax_strategy(
@@ -45,30 +85,53 @@ def evosax_strategy(
 
     The strategy searches u in point = first + sigma0 u from u = 0, so that `sigma0` is the
     standard deviation of those that start at their default of 1, and the unit of every length and
-    learning rate. `settings` go to its constructor, for example `optimizer=optax.adam(0.1)`: some
-    defaults (`Open_ES`: 1e-3) hardly move. Losses that are not finite count as the worst finite
-    one. ValueError for an unknown name and for settings the strategy refuses.
+    learning rate. Losses that are not finite count as the worst finite one.
+
+    Args:
+        name: One of evosax's distribution-based strategies.
+        dim: Numbers in a point, 1 or more.
+        population: Candidates per iteration. Strategies that mirror their candidates want an even
+            number; `SV_CMA_ES` and `SV_Open_ES` divide it between two populations.
+        sigma0: Standard deviation of the first candidates, above 0, in units of the search space.
+        **settings: Arguments of the strategy's constructor, for example
+            `optimizer=optax.adam(0.1)`.
+
+    Returns:
+        The search.
+
+    Raises:
+        ValueError: There is no such strategy, or it refuses the settings.
     """
+    whole("dim", dim, 1)
+    whole("population", population, 1)
+    if not is_array(sigma0):
+        positive("sigma0", sigma0)
     strategy = _build(name, dim, population, settings)
     params = strategy.default_params
+    populations = getattr(strategy, "num_populations", None)
 
-    def init(key: Array, point: Float[Array, " d"], loss: Float[Array, ""]) -> tuple[State, Trace]:
+    def init(
+        key: Array, point: Float[Array, " d"], loss: Float[Array, ""]
+    ) -> tuple[EvosaxState, Trace]:
         best = Candidate(point, finite_or_inf(loss))
-        begun = strategy.init(key, jnp.zeros_like(point), params)
-        state = State(point, best, jnp.int32(0), point, jnp.int32(1), begun)
+        begun = strategy.init(key, jnp.zeros((populations, dim) if populations else dim), params)
+        begun = jax.tree.map(jnp.asarray, begun)
+        state = EvosaxState(point, best, jnp.int32(0), point, jnp.int32(1), begun)
         return state, start_trace(best)
 
-    def step(key: Array, state: State, objective: Objective) -> tuple[State, Trace]:
+    def step(key: Array, state: EvosaxState, objective: Objective) -> tuple[EvosaxState, Trace]:
         ask_key, tell_key = jax.random.split(key)
         units, asked = strategy.ask(ask_key, state.strategy_state, params)
-        points = state.origin + sigma0 * units
+        points = (state.origin + sigma0 * units).astype(state.origin.dtype)
         losses = jax.vmap(objective)(points)
-        told, _ = strategy.tell(tell_key, units, _worst_if_failed(losses), asked, params)
+        ranked = _worst_if_failed(losses).astype(units.dtype)
+        told, _ = strategy.tell(tell_key, units, ranked, asked, params)
+        mean = told.mean.mean(axis=0) if populations else told.mean
         state = state._replace(
-            mean=state.origin + sigma0 * strategy.get_mean(told),
+            mean=(state.origin + sigma0 * mean).astype(state.origin.dtype),
             best=keep_better(state.best, points, losses),
-            evaluations=state.evaluations + population,
-            strategy_state=told,
+            evaluations=state.evaluations + len(points),
+            strategy_state=cast_like(told, state.strategy_state),
         )
         return state, summarise(state.best, points, losses, state.evaluations)
 
@@ -80,9 +143,17 @@ def _build(name: str, dim: int, population: int, settings: dict[str, Any]) -> An
     if name not in distribution_based_algorithms:
         choices = ", ".join(sorted(distribution_based_algorithms))
         raise ValueError(f"There is no evosax strategy {name!r}; choose one of {choices}.")
+    multiple = MULTIPLES.get(name, 1)
+    if population % multiple:
+        raise ValueError(
+            f"The population of {name} is {population}; give a multiple of {multiple}, as"
+            f" {population + -population % multiple}."
+        )
+    settings = _defaults(name, dim) | settings
+    each = population // settings.get("num_populations", 1)
     try:
         return distribution_based_algorithms[name](
-            population_size=population,
+            population_size=each,
             solution=jnp.zeros(dim),
             metrics_fn=lambda *_: {},  # the default keeps three codes per generation
             **settings,
@@ -92,6 +163,18 @@ def _build(name: str, dim: int, population: int, settings: dict[str, Any]) -> An
             f"evosax cannot build {name} with a population of {population} and the settings"
             f" {sorted(settings)}: {error}"
         ) from error
+
+
+def _defaults(name: str, dim: int) -> dict[str, Any]:
+    """Settings without which a strategy hardly moves, or cannot be built."""
+    settings: dict[str, Any] = {}
+    if name in FOLLOW_A_GRADIENT:
+        settings["optimizer"] = optax.adam(LEARNING_RATE)
+    if name in SEVERAL_POPULATIONS:
+        settings["num_populations"] = 2
+    if name == "RandomSearch":
+        settings["sampling_fn"] = lambda key: jax.random.normal(key, (dim,))
+    return settings
 
 
 def _worst_if_failed(losses: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxshape.checks import whole
 from jaxshape.search.batching import select
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
@@ -20,7 +21,7 @@ POLISH = 0.2
 """Share of the iterations that are left to the gradient."""
 
 
-class State(NamedTuple):
+class HybridState(NamedTuple):
     """The two searches, of which one is at work."""
 
     mean: Float[Array, " d"]
@@ -37,20 +38,36 @@ def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
     return polished(
         build_refiner("cma", dim, config),
         build_refiner(f"gradient:{variant or 'lbfgs'}", dim, config),
-        round((1 - POLISH) * config.iterations),
+        max(1, round((1 - POLISH) * config.iterations)),
     )
 
 
 def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
-    """`search` until it stops, but at most for `iterations`; then `polish` from its best point."""
+    """One search, then another one from the best point that it found.
 
-    def init(key: Array, point: Float[Array, " d"], loss: Float[Array, ""]) -> tuple[State, Trace]:
+    Args:
+        search: The first search, until it stops.
+        polish: The second search.
+        iterations: Iterations of the first search at most, 1 or more.
+
+    Returns:
+        Both as one search.
+
+    Raises:
+        ValueError: `iterations` is no whole number from 1 up.
+    """
+    whole("iterations", iterations, 1)
+
+    def init(
+        key: Array, point: Float[Array, " d"], loss: Float[Array, ""]
+    ) -> tuple[HybridState, Trace]:
         first, trace = search.init(key, point, loss)
         second, _ = polish.init(key, point, loss)
         begun = jnp.bool_(False), jnp.int32(0)
-        return State(first.mean, first.best, first.stop, (first, trace), second, *begun), trace
+        state = HybridState(first.mean, first.best, first.stop, (first, trace), second, *begun)
+        return state, trace
 
-    def step(key: Array, state: State, objective: Objective) -> tuple[State, Trace]:
+    def step(key: Array, state: HybridState, objective: Objective) -> tuple[HybridState, Trace]:
         # A batch has objects in both searches, so both take their step; but the one that rests
         # asks for points that are not finite, which are not decoded.
         def only(wanted: Bool[Array, ""]) -> Objective:
@@ -76,7 +93,9 @@ def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
         begins = ~polishing & ((count >= iterations) | (searched.stop != StopReason.RUNNING))
         fresh, _ = polish.init(begin_key, best.point, best.loss)
         polished = select(begins, fresh, polished)
-        state = State(mean, best, stop, (searched, trace), polished, polishing | begins, count)
+        state = HybridState(
+            mean, best, stop, (searched, trace), polished, polishing | begins, count
+        )
         return state, shown
 
     return Refiner(init, step)

@@ -7,7 +7,8 @@ import optax
 import pytest
 from problems import run_batch, sphere
 
-from jaxshape.search.methods.evosax import evosax_strategy
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods.evosax import build, evosax_strategy
 
 KEY = jax.random.key(0)
 pytestmark = pytest.mark.usefixtures("compile_quickly")
@@ -41,14 +42,48 @@ def test_failures_never_reach_the_strategy_and_the_start_counts():
     assert traces.best_loss[3, 0] == sphere(points[3])  # no candidate beats this start
 
 
+def first_spend(refiner):
+    """Candidates of one iteration."""
+    state, _ = refiner.init(KEY, jnp.ones(3), jnp.float32(3.0))
+    points = []
+    _, trace = refiner.step(KEY, state, lambda point: points.append(point) or sphere(point))
+    assert len(points) == 1  # traced once
+    return int(trace.evaluations) - 1
+
+
 @pytest.mark.parametrize(
-    "name, population, message",
+    "variant, population",
+    [("SNES", 17), ("SNES@18", 18), ("Open_ES", 18), ("Open_ES@6", 6), ("SV_Open_ES", 20)],
+)
+def test_a_name_may_set_the_population_and_mirrored_candidates_make_it_even(variant, population):
+    assert first_spend(build(variant, 3, RefineConfig(population=17))) == population
+
+
+@pytest.mark.parametrize(
+    "variant, message",
     [
-        ("CMAES", 10, "choose one of .*CMA_ES.*xNES"),
-        ("Open_ES", 9, "even"),
-        ("RandomSearch", 10, "sampling_fn"),
+        ("CMAES", "choose one of .*CMA_ES.*xNES"),
+        ("Open_ES@9", "population of Open_ES is 9; give a multiple of 2, as 10"),
+        ("SV_Open_ES@18", "give a multiple of 4, as 20"),
+        ("SNES@", "evosax:SNES@ has no population behind the @; give a whole number"),
+        ("SNES@-3", "no population behind the @"),
+        ("SNES@0", "population is 0; give a whole number, 1 or more"),
+        ("ESMC@2", "evosax cannot build ESMC .* must be >= 4"),
     ],
 )
-def test_bad_settings_say_what_to_do(name, population, message):
+def test_bad_names_say_what_to_do(variant, message):
     with pytest.raises(ValueError, match=message):
-        evosax_strategy(name, dim=3, population=population, sigma0=0.3)
+        build(variant, 3, RefineConfig())
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        ({"sigma0": -0.1}, "sigma0 is -0.1; give a number above 0"),
+        ({"dim": 0}, "dim is 0"),
+        ({"optimiser": None}, "evosax cannot build SNES .*unexpected keyword argument 'optimiser'"),
+    ],
+)
+def test_bad_settings_say_what_to_do(changed, message):
+    with pytest.raises(ValueError, match=message):
+        evosax_strategy("SNES", **{"dim": 3, "population": 10, "sigma0": 0.3} | changed)

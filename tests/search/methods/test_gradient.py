@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import optax.contrib
 import pytest
 from problems import ellipsoid, rosenbrock, run, run_batch, sphere
 
 from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods.gradient import STEP_SIZES, build, gradient
+from jaxshape.search.methods.gradient import STEP_SIZES, UNUSABLE, build, gradient
 from jaxshape.search.refiner import StopReason
 
 KEY = jax.random.key(0)
@@ -161,8 +162,33 @@ def test_settings_choose_the_optimiser_and_its_step():
     np.testing.assert_allclose(first_step("sgd", step_size=0.25), 0.25, rtol=1e-6)
     np.testing.assert_allclose(first_step("adam", step_size=0.5), 0.25, rtol=1e-4)  # 0.5 long
 
+    np.testing.assert_allclose(first_step("polyak_sgd", step_size=0.2), 0.2, rtol=1e-6)
+    np.testing.assert_allclose(first_step("sgd"), STEP_SIZES["whitened"], rtol=1e-6)
 
-@pytest.mark.parametrize("name", ["adamm", "polyak_sgd", "dpsgd", "Params", "sgd "])
+
+@pytest.mark.parametrize("name", ["adamm", "clip", "scale_by_madgrad", "Params", "sgd ", "_src"])
 def test_names_of_no_optimiser_say_so(name):
     with pytest.raises(ValueError, match=f"no optimiser '{name}' .*adam, lbfgs"):
         build(name, 3, RefineConfig())
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_optimisers_that_no_name_stands_for_are_refused_with_the_reason(name):
+    assert name in vars(optax) | vars(optax.contrib)
+    with pytest.raises(
+        ValueError, match=f"gradient:{name} is no method: it (clips|changes|estimates) .*"
+    ):
+        build(name, 3, RefineConfig())
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"optimizer": -0.1}, "step_size is -0.1; give a number above 0"),
+        ({"optimizer": 0.1, "tolerance": -1.0}, "tolerance is -1.0; give a number, 0 or more"),
+        ({"optimizer": 0.1, "patience": 0}, "patience is 0; give a whole number, 1 or more"),
+    ],
+)
+def test_bad_settings_say_what_to_do(settings, message):
+    with pytest.raises(ValueError, match=message):
+        gradient(**settings)

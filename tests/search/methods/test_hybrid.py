@@ -7,7 +7,7 @@ import optax
 import pytest
 from problems import ellipsoid, run_batch, sphere
 
-from jaxshape.search.cma import cma
+from jaxshape.search.methods.cma import cma
 from jaxshape.search.methods.gradient import gradient
 from jaxshape.search.methods.hybrid import polished
 from jaxshape.search.refiner import StopReason
@@ -86,3 +86,8 @@ def test_each_object_is_polished_when_its_own_search_stops():
     np.testing.assert_array_equal(
         traces.evaluations[:, -1], 1 + 7 * generations + states.iterations
     )
+
+
+def test_bad_settings_say_what_to_do():
+    with pytest.raises(ValueError, match="iterations is 0; give a whole number, 1 or more"):
+        polished(SEARCH, gradient(0.1), 0)

@@ -1,0 +1,81 @@
+"""The names of searches, and the function behind each; free of JAX, so that help answers at once.
+
+    family, family:variant                     a module of `methods/`, or an entry point of the
+                                               group `jaxshape.methods`
+    package.module:function[@variant]          any function that can be imported
+
+Behind every name is a function `build(variant, dim, config)`. It gives a `Refiner` over points of
+`dim` numbers with the settings of a `RefineConfig`, and raises `ValueError` for a variant that it
+does not know; without a variant, it is given None.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+GROUP = "jaxshape.methods"
+"""Entry points that packages offer their searches by: NAME = "package.module:function"."""
+
+Build = Callable[..., Any]
+
+
+def families() -> list[str]:
+    """The families of searches: those of this package, and those that installed ones offer."""
+    return sorted({*_own(), *_offered()})
+
+
+def find_build(name: str) -> tuple[Build, str | None]:
+    """The function behind a name, and the variant that it is to build.
+
+    Args:
+        name: Of a search.
+
+    Returns:
+        The function, and the variant or None.
+
+    Raises:
+        ValueError: There is no such search, or what the name points to cannot be imported.
+    """
+    family, _, variant = name.partition(":")
+    if "." in family and variant:
+        function, _, variant = variant.partition("@")
+        return _imported(name, family, function), variant or None
+    if family in _own():
+        return importlib.import_module(f"{__package__}.methods.{family}").build, variant or None
+    if family in _offered():
+        offered = _offered()[family]
+        return _imported(name, offered.module, offered.attr), variant or None
+    raise ValueError(
+        f"There is no method {name!r}; choose from {', '.join(families())}, or 'encoder' for no"
+        " search at all. Some have variants: cma:ipop, gradient:adam, evosax:Sep_CMA_ES. A function"
+        " of your own goes by its import path, package.module:function."
+    )
+
+
+def _own() -> list[str]:
+    """The modules of `methods/`, found as files."""
+    folder = Path(__file__).parent / "methods"
+    return [module.name for module in pkgutil.iter_modules([str(folder)])]
+
+
+def _offered() -> dict[str, EntryPoint]:
+    """The entry points of installed packages."""
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def _imported(name: str, module: str, function: str) -> Build:
+    """A function by its import path."""
+    try:
+        found = getattr(importlib.import_module(module), function, None)
+    except Exception as error:  # whatever a module raises while it is imported
+        raise ValueError(
+            f"The method {name!r} cannot be imported: {type(error).__name__}: {error}."
+        ) from error
+    if not callable(found):
+        raise ValueError(
+            f"The method {name!r} cannot be imported: {module} has no function {function!r}."
+        )
+    return found
