@@ -1,33 +1,37 @@
 """The refinement loop: what every search promises over a batch of objects."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxshape.geometry.evidence import Grids
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.refiner import StopReason
+from jaxshape.search.residuals import LESS_FREE, cross_entropy, weigh
 from jaxshape.search.run import refine
 from jaxshape.search.space import LatentSpace
 
 OBJECTS, D, SHAPE, ITERATIONS = 3, 4, (3, 3, 3), 8
+FINAL = 2 * OBJECTS  # codes decoded in the end: the best, and where the search stands
 KEYS = jax.random.split(jax.random.key(0), OBJECTS)
 CONFIG = RefineConfig(iterations=ITERATIONS, population=6, sigma0=0.3, tolerance=0.0, space="raw")
 rng = np.random.default_rng(1)
-PARAMS = jnp.asarray(rng.normal(size=(D, *SHAPE)), jnp.float32)
+PARAMS = jnp.asarray(rng.normal(size=(D, *SHAPE)), jnp.float32)  # those of `counted`
 CODES = jnp.asarray(rng.normal(size=(OBJECTS, D)), jnp.float32)
-TARGETS = target(
-    *jnp.asarray(rng.random((2, OBJECTS, *SHAPE)) < 0.5), jnp.tensordot(CODES, PARAMS, 1)
+TARGETS = weigh(
+    Grids(*jnp.asarray(rng.random((2, OBJECTS, *SHAPE)) < 0.5)),
+    jnp.tensordot(CODES, PARAMS, 1),
+    LESS_FREE,
 )
 METHODS = ["cma", "gradient", "gradient:lbfgs", "evosax:SNES", "hybrid:adam"]  # and `hybrid` below
 
 
-def searching(method, iterations=ITERATIONS, config=CONFIG, **options):
+def searching(prior, method, iterations=ITERATIONS, config=CONFIG, **options):
     refiner = build_refiner(method, D, config)
-    return jax.jit(partial(refine, refiner=refiner, iterations=iterations, **options))
+    options = {"refiner": refiner, "iterations": iterations} | options
+    return jax.jit(lambda keys, *args, **more: refine(keys, prior, *args, **options, **more))
 
 
 def loss_of(code, i, targets=TARGETS):
@@ -48,21 +52,21 @@ def method(request):
 
 
 @pytest.fixture(scope="module")
-def search(method, decoder):
-    return searching(method)
+def search(method, counted):
+    return searching(counted, method)
 
 
 @pytest.fixture(scope="module")
-def counts(decoder):
+def counts(counter):
     """Codes decoded by the search of each method."""
     return {}
 
 
 @pytest.fixture(scope="module")
-def refined(method, search, decoder, counts):
-    decoder.codes()
-    found = search(KEYS, PARAMS, CODES, TARGETS)
-    counts[method] = decoder.codes()
+def refined(method, search, counter, counts):
+    counter.codes()
+    found = search(KEYS, CODES, TARGETS)
+    counts[method] = counter.codes() - FINAL
     return found
 
 
@@ -103,21 +107,21 @@ def test_the_trace_never_rises_and_counts_what_was_decoded(method, refined, coun
         assert counted == counts[method]
 
 
-def test_a_key_decides_the_outcome_and_a_second_call_traces_nothing(search, refined, decoder):
-    before = decoder.traces
-    again = search(KEYS, PARAMS, CODES, TARGETS)
+def test_a_key_decides_the_outcome_and_a_second_call_traces_nothing(search, refined, counter):
+    before = counter.traces
+    again = search(KEYS, CODES, TARGETS)
     jax.tree.map(np.testing.assert_array_equal, refined, again)
-    other = search(jax.random.split(jax.random.key(7), OBJECTS), PARAMS, CODES, TARGETS)
+    other = search(jax.random.split(jax.random.key(7), OBJECTS), CODES, TARGETS)
     if draws(refined):
         assert not np.allclose(refined.code, other.code)
     else:
         np.testing.assert_array_equal(refined.code, other.code)
-    assert decoder.traces == before > 0
+    assert counter.traces == before > 0
 
 
 def test_an_object_that_fails_does_not_disturb_the_others(search, refined):
     poisoned = jax.tree.map(lambda x: x.at[1].set(jnp.nan), TARGETS)
-    found = search(KEYS, PARAMS, CODES, poisoned)
+    found = search(KEYS, CODES, poisoned)
     for row in (0, 2):
         np.testing.assert_array_equal(found.code[row], refined.code[row])
         np.testing.assert_array_equal(found.loss[row], refined.loss[row])
@@ -127,7 +131,7 @@ def test_an_object_that_fails_does_not_disturb_the_others(search, refined):
 
 def test_equal_objects_search_by_keys_of_their_own(search, refined):
     same = jax.tree.map(lambda x: jnp.stack([x[0]] * OBJECTS), (CODES, TARGETS))
-    found = search(KEYS, PARAMS, *same)
+    found = search(KEYS, *same)
     if draws(refined):
         assert not np.allclose(found.code[0], found.code[1])
     np.testing.assert_array_equal(found.code[0], refined.code[0])
@@ -135,7 +139,7 @@ def test_equal_objects_search_by_keys_of_their_own(search, refined):
 
 @pytest.mark.parametrize("method", ["cma"], indirect=True)
 def test_an_object_alone_finds_what_it_finds_in_company(search, refined):
-    alone = search(KEYS[1:2], PARAMS, CODES[1:2], of_object(1))
+    alone = search(KEYS[1:2], CODES[1:2], of_object(1))
     np.testing.assert_allclose(alone.code[0], refined.code[1], rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(alone.loss[0], refined.loss[1], rtol=1e-4)
 
@@ -148,13 +152,13 @@ SAME_CODES, SAME_TARGETS = jax.tree.map(lambda x: jnp.stack([x[0]] * OBJECTS), (
 
 
 @pytest.fixture(scope="module")
-def to_goal(decoder):
+def to_goal(counted):
     """A search until its loss is that of the last argument."""
     refiner = build_refiner("cma", D, CONFIG)
 
     def search(codes, targets, goal, previous=None):
         return refine(
-            KEYS, PARAMS, codes, targets, refiner, LONG, target_loss=goal, previous=previous
+            KEYS, counted, codes, targets, refiner, LONG, target_loss=goal, previous=previous
         )
 
     return jax.jit(search)
@@ -165,13 +169,15 @@ def endless(to_goal):
     return to_goal(SAME_CODES, SAME_TARGETS, -jnp.inf)
 
 
-def test_an_object_at_its_target_freezes_and_is_no_longer_decoded(to_goal, endless, decoder):
+def test_an_object_at_its_target_freezes_and_is_no_longer_decoded(
+    to_goal, endless, counter, counted
+):
     """Up to the first iteration at the target, the search is the one without a target."""
     losses = np.asarray(endless.trace.best_loss)
     goal = float(losses[:, 12].max())
-    decoder.codes()
+    counter.codes()
     found = to_goal(SAME_CODES, SAME_TARGETS, goal)
-    count = decoder.codes()
+    count = counter.codes() - FINAL
 
     reached = np.argmax(losses <= goal, axis=1) + 1
     assert 1 < reached.min() < reached.max() < LONG
@@ -186,30 +192,30 @@ def test_an_object_at_its_target_freezes_and_is_no_longer_decoded(to_goal, endle
         np.testing.assert_array_equal(found.state.best.loss[i], best[last - 1])
 
 
-def test_a_first_code_that_is_good_enough_is_the_answer(to_goal, decoder):
-    decoder.codes()
+def test_a_first_code_that_is_good_enough_is_the_answer(to_goal, counter, counted):
+    counter.codes()
     found = to_goal(CODES, TARGETS, 1e9)
-    assert decoder.codes() == OBJECTS  # the first codes
+    assert counter.codes() == OBJECTS + FINAL  # the first codes
     np.testing.assert_array_equal(found.iterations, 0)
     np.testing.assert_array_equal(found.stop, StopReason.TARGET)
     np.testing.assert_array_equal(found.code, CODES)
 
 
-def test_a_search_that_converged_stops_and_costs_no_quality(to_goal, decoder):
+def test_a_search_that_converged_stops_and_costs_no_quality(to_goal, counter, counted):
     full = to_goal(CODES, TARGETS, -jnp.inf)
-    decoder.codes()
+    counter.codes()
     config = RefineConfig(population=6, sigma0=0.3, tolerance=1e-5)
-    found = searching("cma", 150, config)(KEYS, PARAMS, CODES, TARGETS)
+    found = searching(counted, "cma", 150, config)(KEYS, CODES, TARGETS)
     assert set(np.asarray(found.stop)) <= {StopReason.TOLFUN, StopReason.TOLFUNHIST}
     assert np.all(found.iterations < 150) and np.all(found.iterations > 20)
-    assert decoder.codes() == np.sum(1 + 6 * found.iterations)
+    assert counter.codes() == np.sum(1 + 6 * found.iterations) + FINAL
     assert np.all(found.loss < full.loss + 1e-4)
 
 
-def test_polishing_counts_towards_the_iterations_of_a_hybrid(decoder):
+def test_polishing_counts_towards_the_iterations_of_a_hybrid(counted):
     """CMA-ES stops early, the gradient goes on from there, and stops by its own criterion."""
     config = RefineConfig(population=6, sigma0=0.3, tolerance=1e-5, iterations=150)
-    found = searching("hybrid", 150, config)(KEYS, PARAMS, CODES, TARGETS)
+    found = searching(counted, "hybrid", 150, config)(KEYS, CODES, TARGETS)
     np.testing.assert_array_equal(found.stop, StopReason.TOLFUNHIST)
     handed_over = found.state.searched[0].generation
     assert np.all(handed_over < 120) and np.all(found.iterations > handed_over)
@@ -243,11 +249,11 @@ def test_after_a_small_change_a_warm_start_needs_fewer_iterations(to_goal, endle
     assert np.all(2 * warm.iterations < cold.iterations)
 
 
-def test_searches_without_a_resume_begin_again_at_the_best_point(endless):
+def test_searches_without_a_resume_begin_again_at_the_best_point(endless, counted):
     """The losses of the first codes say nothing of where the search begins now."""
     best, known = endless.state.best.point, jnp.zeros(OBJECTS)
-    again = searching("evosax:SNES", 1)
-    found = again(KEYS, PARAMS, CODES, CHANGED, first_losses=known, previous=endless.state)
+    again = searching(counted, "evosax:SNES", 1)
+    found = again(KEYS, CODES, CHANGED, first_losses=known, previous=endless.state)
     np.testing.assert_array_equal(found.state.origin, best)
     for i in range(OBJECTS):
         assert 0 < found.state.best.loss[i] <= loss_of(best[i], i, CHANGED) * (1 + 1e-5)
@@ -256,24 +262,50 @@ def test_searches_without_a_resume_begin_again_at_the_best_point(endless):
 # --- spaces and penalties -----------------------------------------------------------------------
 
 
-def test_a_space_only_changes_the_coordinates(decoder):
+def test_a_space_only_changes_the_coordinates(counted):
     """A fixed step in the space u, code = mean + a u, is one of a^2 times its length in codes."""
     space = LatentSpace(jnp.arange(4.0), 2 * jnp.eye(D))
-    short = searching("gradient", config=RefineConfig(step_size=0.1), space=space)
-    long = searching("gradient", config=RefineConfig(step_size=0.4))
-    short, long = (search(KEYS, PARAMS, CODES, TARGETS) for search in (short, long))
+    short = searching(counted, "gradient", config=RefineConfig(step_size=0.1), space=space)
+    long = searching(counted, "gradient", config=RefineConfig(step_size=0.4))
+    short, long = (search(KEYS, CODES, TARGETS) for search in (short, long))
     np.testing.assert_allclose(short.code, long.code, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(short.loss, long.loss, rtol=1e-4)
     np.testing.assert_allclose(short.state.mean, (long.state.mean - jnp.arange(4.0)) / 2, atol=1e-4)
 
 
-def test_a_penalty_is_part_of_the_loss(decoder):
+def test_a_penalty_is_part_of_the_loss(counted):
     def penalty(code):
         return 1e3 * jnp.sum((code - 2) ** 2)
 
-    descent = searching("gradient", config=RefineConfig(step_size=4e-4), penalty=penalty)
-    found = descent(KEYS, PARAMS, CODES, TARGETS)
+    descent = searching(counted, "gradient", config=RefineConfig(step_size=4e-4), penalty=penalty)
+    found = descent(KEYS, CODES, TARGETS)
     np.testing.assert_allclose(found.code, 2, atol=0.01)
     for i in range(OBJECTS):
         expected = loss_of(found.code[i], i) + penalty(found.code[i])
         np.testing.assert_allclose(found.loss[i], expected, rtol=1e-4)
+
+
+# --- what is given ------------------------------------------------------------------------------
+
+
+def test_one_key_is_one_for_each_object(counted):
+    search = searching(counted, "cma")
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        search(jax.random.key(0), CODES, TARGETS),
+        search(KEYS, CODES, TARGETS),
+    )
+
+
+@pytest.mark.parametrize(
+    "keys, codes, said",
+    [
+        (KEYS[:2], CODES, r"keys of shape \(2,\) for 3 objects; give one for each"),
+        (KEYS[:1], CODES[0], r"codes have shape \(4,\); give \[object, 4\].*code\[None\]"),
+        (KEYS, CODES[:, :3], r"codes have shape \(3, 3\); give \[object, 4\]"),
+    ],
+)
+def test_keys_and_codes_that_do_not_fit_are_named(counted, keys, codes, said):
+    refiner = build_refiner("cma", D, CONFIG)
+    with pytest.raises(ValueError, match=said):
+        refine(keys, counted, codes, TARGETS, refiner, 2)
