@@ -97,11 +97,14 @@ def flat_index(
     return jnp.where(inside, index, resolution**3)
 
 
-def voxel_centers(frame: GridFrame, resolution: int = RESOLUTION) -> Float[Array, "*batch n 3"]:
-    """Object-frame centres of all `n = resolution**3` voxels, in the order of a raveled grid."""
+def voxel_centers(resolution: int = RESOLUTION) -> Float[Array, "n 3"]:
+    """The centres of all voxels, in the order of a raveled grid.
+
+    Args:
+        resolution: Voxels along each axis.
+
+    Returns:
+        Voxel coordinates of the `resolution**3` centres; `object_from_voxel` takes them to metres.
+    """
     axis = jnp.arange(resolution) + 0.5
-    centers = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    batch = frame.origin.shape[:-1]
-    return object_from_voxel(
-        frame, jnp.broadcast_to(centers.reshape(-1, 3), (*batch, axis.size**3, 3))
-    )
+    return jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)

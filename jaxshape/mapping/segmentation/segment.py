@@ -13,12 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import mean
 from scipy.spatial import KDTree
-from skimage.color import rgb2lab
-from skimage.measure import label
 
 from jaxshape import checks
 from jaxshape.data.boxes import Box, points_in_box
-from jaxshape.geometry.sensor import tolerance
 from jaxshape.mapping.segmentation.clusters import (
     Pixel,
     Scene,
@@ -28,20 +25,11 @@ from jaxshape.mapping.segmentation.clusters import (
     distance,
     enlarged,
     joined,
-    jumps,
     look,
-    over_footprint,
     reduced,
 )  # fmt: skip
-from jaxshape.mapping.segmentation.planes import (
-    Plane,
-    floor_plane,
-    height_above,
-    subsample,
-)
-
-SEPARABLE = 0.95
-"""Colours tell the object from the floor if they put this share of known pixels where they are."""
+from jaxshape.mapping.segmentation.confidence import Doubt, doubts_of, falling, judged
+from jaxshape.mapping.segmentation.feet import feet_on
 
 CLICK_RADIUS = 4.0
 """Pixels of the reduced image around a click that may be meant."""
@@ -57,9 +45,6 @@ NOTHING = np.zeros((0, 3))
 
 CANDIDATES = 5
 """Clusters that are joined with what belongs to them before one is chosen."""
-
-Doubt = tuple[float, str]
-"""Evidence from 0, against the segmentation, to 1, for it; and the doubt it raises, in words."""
 
 
 class Segmentation(NamedTuple):
@@ -130,9 +115,9 @@ def segment(
     chosen, doubt = (_nearest if clicked else _most_central)(labels, view, target)
     segmented = np.isin(labels, chosen)
     if color is not None and view.floor is not None:
-        segmented |= _feet(segmented, reduced(color, view.stride), view, view.floor.plane)
-    doubts = [doubt, *_doubts(segmented, behind, view, clicked=clicked)]
-    return Segmentation(enlarged(segmented, view, depth) & allowed, *_judged(doubts, len(chosen)))
+        segmented |= feet_on(segmented, reduced(color, view.stride), view, view.floor.plane)
+    doubts = [doubt, *doubts_of(segmented, behind, view, clicked=clicked)]
+    return Segmentation(enlarged(segmented, view, depth) & allowed, *judged(doubts, len(chosen)))
 
 
 def segment_inside(
@@ -224,7 +209,7 @@ def _nearest(labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel) -> tupl
     the disc around it, the nearest to the camera is meant.
     """
     away = np.array([distance(labels == i, target) for i in range(1, labels.max() + 1)])
-    doubt = _falling(away.min(), 3.0, 15.0), "nothing stands where the click is"
+    doubt = falling(away.min(), 3.0, 15.0), "nothing stands where the click is"
     row, column = np.indices(labels.shape)
     disc = np.hypot(row - target[0], column - target[1]) <= CLICK_RADIUS
     shares = np.array([np.mean(labels[disc] == i) for i in range(1, labels.max() + 1)])
@@ -256,121 +241,4 @@ def _most_central(
     groups = sorted((joined(labels, i, view) for i in seeds), key=lambda group: -worth(group))
     rivals = [worth(group) for group in groups if not set(group) & set(groups[0])]
     rival = max(rivals, default=0.0) / max(worth(groups[0]), 1e-9)
-    return groups[0], (_falling(rival, 0.3, 1.2), "something else is as large and central")
-
-
-# Feet on the floor -----------------------------------------------------------------------------
-
-
-def _feet(
-    segmented: Bool[np.ndarray, "h w"], color: UInt8[np.ndarray, "h w 3"], view: Scene, floor: Plane
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels that were taken for floor, but have the colour of the object above or beside them.
-
-    Shadows have its colour too, at times, but lie on the floor: a patch must on average be a little
-    above it. Empty where colours do not tell the object from the floor.
-    """
-    height = np.nan_to_num(height_above(floor, view.points) / tolerance(view.z), nan=9.0)
-    flat = (np.abs(height) < 1.5) & ~segmented
-    beside = flat.copy()
-    beside[flat] = over_footprint(view.points[flat], view.points[segmented], floor)
-    feet = np.zeros_like(segmented)
-    feet[beside] = _looks_like(rgb2lab(color), beside, segmented, flat & ~beside)
-    patches = _patches(feet)
-    raised = np.array(mean(height, patches, range(patches.max() + 1))) > 0.3
-    feet &= raised[patches]
-    attached = _patches(feet | segmented)
-    return feet & np.isin(attached, attached[segmented])
-
-
-def _patches(pixels: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
-    """Connected pixels, diagonals included: 1, 2, ...; 0 elsewhere."""
-    return np.asarray(label(pixels, connectivity=2))
-
-
-def _looks_like(
-    lab: Float[np.ndarray, "h w 3"],
-    doubtful: Bool[np.ndarray, "h w"],
-    ours: Bool[np.ndarray, "h w"],
-    others: Bool[np.ndarray, "h w"],
-) -> Bool[np.ndarray, " n"]:
-    """Whether most of the known pixels nearest in colour to each doubtful one are ours.
-
-    False for all where the same question, asked of the known pixels, gets too many wrong answers.
-    """
-    rng = np.random.default_rng(0)
-    known = [subsample(lab[pixels], 1000, rng) for pixels in (ours, others)]
-    unknown = lab[doubtful]
-    if min(len(unknown), *map(len, known)) < 10:
-        return np.zeros(len(unknown), bool)
-    tree = KDTree(np.concatenate(known))
-
-    def share_of_ours(colors, ranks):
-        return (tree.query(colors, k=ranks)[1] < len(known[0])).mean(axis=1)
-
-    shares = [share_of_ours(colors, range(2, 11)) for colors in known]  # the first is itself
-    right = (np.mean(shares[0] > 0.5) + np.mean(shares[1] < 0.5)) / 2
-    return (share_of_ours(unknown, range(1, 10)) > 0.7) & (right > SEPARABLE)
-
-
-# How sure --------------------------------------------------------------------------------------
-
-
-def _doubts(
-    segmented: Bool[np.ndarray, "h w"],
-    behind: Bool[np.ndarray, "h w"],
-    view: Scene,
-    *,
-    clicked: bool,
-) -> list[Doubt]:
-    """What the segmented pixels say for or against themselves.
-
-    What was clicked on need not be seen to stand on a floor: its feet may be out of sight.
-    """
-    hidden, touching = _outline(segmented, behind, view)
-    size = float(np.linalg.norm(np.ptp(view.points[segmented], axis=0)))
-    return [
-        (1 - _falling(segmented.mean(), 0.0, 0.01), "it covers hardly any of the image"),
-        (_falling(cut(segmented), 0.1, 0.6), "the border of the image cuts it"),
-        (_falling(hidden, 0.05, 0.35), "something nearer hides part of it"),
-        (_falling(touching, 0.1, 0.4), "it touches something that may or may not be part of it"),
-        (_falling(size, 2.0, 3.0), "it is larger than a piece of furniture"),
-        (max(_standing(segmented, view), 0.5 * clicked), "it is not seen to stand on a floor"),
-    ]
-
-
-def _falling(value: float, sure: float, unsure: float) -> float:
-    """1 up to `sure`, 0 from `unsure` on, linear between."""
-    return float(np.clip((unsure - value) / (unsure - sure), 0, 1))
-
-
-def _outline(
-    segmented: Bool[np.ndarray, "h w"], behind: Bool[np.ndarray, "h w"], view: Scene
-) -> tuple[float, float]:
-    """Shares of the outline at which something nearer begins, and at which the surface goes on."""
-    nearer = touching = total = 0
-    for turn in range(4):
-        z, inside, back = (np.rot90(image, turn) for image in (view.z, segmented, behind))
-        here, there = z[:, 1:], z[:, :-1]
-        edge = inside[:, 1:] & ~inside[:, :-1]
-        jump = jumps(here, there, view.spacing)
-        nearer += int((edge & jump & (there < here)).sum())
-        touching += int((edge & ~jump & np.isfinite(there) & ~back[:, :-1]).sum())
-        total += int(edge.sum())
-    return nearer / max(total, 1), touching / max(total, 1)
-
-
-def _standing(segmented: Bool[np.ndarray, "h w"], view: Scene) -> float:
-    """How sure it is that the object stands on the floor; half where no floor is seen."""
-    if view.floor is None:
-        return 0.5
-    floor = floor_plane(view.points.reshape(-1, 3), [view.floor.plane], view.points[segmented])
-    return floor.confidence if floor else 0.0
-
-
-def _judged(doubts: list[Doubt], pieces: int) -> tuple[float, str]:
-    """Confidence, the product of all evidence, and a sentence that names the weakest."""
-    weakest, doubt = min(doubts)
-    found = "One cluster" if pieces == 1 else f"{pieces} clusters that belong together"
-    verdict = doubt if weakest < 0.8 else "nothing speaks against it"
-    return float(np.prod([evidence for evidence, _ in doubts])), f"{found}: {verdict}."
+    return groups[0], (falling(rival, 0.3, 1.2), "something else is as large and central")

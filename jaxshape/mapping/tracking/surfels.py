@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.geometry.grid import RESOLUTION, flat_index
+from jaxshape.geometry.grid import RESOLUTION, flat_index, voxel_centers
 from jaxshape.mapping.tracking.icp import AGREEING, Match, Matches
 
 CELLS = 2 * RESOLUTION
@@ -202,9 +202,7 @@ def _neighbourhoods(
     shift = weight @ offsets
     spread = jnp.einsum("cn,ni,nj->cij", weight, offsets, offsets)
     spread = spread - shift[:, :, None] * shift[:, None, :]
-    axis = jnp.arange(n) + 0.5
-    center = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    return center + shift, spread
+    return voxel_centers(n) + shift, spread
 
 
 def _nearest(is_patch: Bool[Array, " c"]) -> Int[Array, " c"]:
