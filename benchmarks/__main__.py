@@ -1,7 +1,6 @@
 """The command line: runs benchmarks, draws their tables, compares with the baseline."""
 
 import importlib
-import json
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -14,7 +13,7 @@ from rich.table import Table
 
 from benchmarks import NAMES, gate
 from benchmarks.harness import Metric, machine
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,7 @@ def main(options: Options, console: Console) -> int:
         metrics += found
     if options.output:
         results = {"machine": here, "quick": options.quick, "metrics": list(map(asdict, metrics))}
-        with atomic_path(options.output) as path:
-            path.write_text(json.dumps(results, indent=1) + "\n")
+        write_json(options.output, results)
     status = _gate(metrics, here, options, console) if options.gate else 0
     if options.update_baseline:
         gate.update(here, metrics)

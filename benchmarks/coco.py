@@ -37,7 +37,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.stats import fisher_exact
 
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json, write_text
+from jaxshape.report.palette import BLUE, ORANGE
 from jaxshape.search.refiner import StopReason, advance
 from jaxshape.search.restarts import with_restarts
 
@@ -60,8 +61,8 @@ RESULTS = Path(__file__).parent / "results"
 ALGORITHMS = ("ours", "pycma")
 FUNCTIONS = range(1, 25)
 STYLES = {
-    "pycma": {"color": "#E69F00", "linewidth": 3},
-    "ours": {"color": "#0072B2", "linewidth": 1.2},
+    "pycma": {"color": ORANGE, "linewidth": 3},
+    "ours": {"color": BLUE, "linewidth": 1.2},
 }
 
 Restarts = Literal["ipop", "bipop"]
@@ -235,9 +236,7 @@ def run(options: Options) -> Results:
             if not file.exists():
                 print(f"{name:5}  d {dimension:2}  f {function:2}: ", end="", flush=True)
                 reached = _measure(searches[name], instances(function, dimension, budget))
-                file.parent.mkdir(parents=True, exist_ok=True)
-                with atomic_path(file) as path:
-                    path.write_text(json.dumps(reached))
+                write_json(file, reached)
             cells[name][str(function)] = json.loads(file.read_text())
     return found
 
@@ -267,9 +266,8 @@ def store(found: Results, folder: Path, name: str) -> Results:
     file = folder / f"{name}.json"
     earlier = json.loads(file.read_text()) if file.exists() else {}
     results = dict(sorted((earlier | found).items(), key=lambda item: int(item[0])))
-    with atomic_path(file) as path:
-        path.write_text(_compact(results))
-    (folder / f"{name}.md").write_text(report(results))
+    write_text(file, _compact(results))
+    write_text(folder / f"{name}.md", report(results))
     figure = draw(results)
     for suffix in ("png", "svg"):
         figure.savefig(folder / f"{name}.{suffix}", dpi=200)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from benchmarks.harness import Metric, within
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json
 
 BASELINE = Path(__file__).with_name("baseline.json")
 
@@ -77,5 +77,4 @@ def update(machine: dict[str, Any], metrics: Iterable[Metric], path: Path = BASE
     old = stored.get(kind_of(machine), {}).get("metrics", {})
     new = {m.name: float(f"{m.value:.4g}") for m in metrics if m.direction != "info"}
     stored[kind_of(machine)] = {"machine": machine, "metrics": old | new}
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(stored, indent=1) + "\n")
+    write_json(path, stored)

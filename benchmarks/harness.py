@@ -18,6 +18,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxshape.process import processor
+
 ROOT = Path(__file__).parents[1]
 BURST = 0.03
 """Seconds that a function is called again and again before it is another one's turn."""
@@ -145,7 +147,7 @@ def in_fresh_process(function: str, *arguments: Any, **environment: str) -> Any:
 
 def machine() -> dict[str, Any]:
     """What a reader needs to compare figures: processor, device, versions."""
-    model, features = _processor()
+    model, features = processor()
     return {
         "processor": model,
         "cores": _cores(),
@@ -162,13 +164,6 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _processor() -> tuple[str, set[str]]:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    fields = dict(map(str.strip, line.split(":", 1)) for line in lines if ":" in line)
-    return fields.get("model name", platform.processor()), set(fields.get("flags", "").split())
 
 
 def _version(package: str) -> str | None:

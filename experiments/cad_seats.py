@@ -26,7 +26,7 @@ import tyro
 from rich.progress import track
 
 from jaxshape.data.meshes import MeshSource, Model, Skipped, list_meshes, load
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json
 from jaxshape.results.surface import write_mesh
 
 LIST = Path(__file__).with_suffix(".json")
@@ -82,9 +82,7 @@ def collect(seats: Sequence[Seat], packages: Path, output: Path) -> None:
     """
     for seat in track(seats, description="CAD seats"):
         write_mesh(read_seat(seat, packages).mesh, output / f"{seat.name}.ply")
-    manifest = [seat._asdict() for seat in seats]
-    with atomic_path(output / "manifest.json") as path:
-        path.write_text(json.dumps(manifest, indent=1, ensure_ascii=False), encoding="utf-8")
+    write_json(output / "manifest.json", [seat._asdict() for seat in seats])
 
 
 def read_seat(seat: Seat, packages: Path) -> Model:

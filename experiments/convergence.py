@@ -23,13 +23,17 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float, Int
 
+from figures import LINES, PAGE, draw_mean, save_column
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
 from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import PINK, RED
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import LINES, PAGE, PINK, RED, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import reconstruct, refiner_for
+from study import (
     TUNED,
     Claim,
     Contestant,
@@ -42,8 +46,6 @@ from jaxshape.results.study import (
     mean_interval,
     mean_low_high,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.reconstruction import reconstruct, refiner_for
 
 RESULTS = Path(__file__).parent / "results"
 CHAIRS_AT_A_TIME = 8

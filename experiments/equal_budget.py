@@ -26,24 +26,19 @@ import tyro
 from jaxtyping import Array, Float, Int
 from scipy.stats import spearmanr
 
+from figures import LINES, PAGE, interval, save_column
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.results.figures import (
-    BLUE,
-    GREY,
-    INK,
-    LINES,
-    PAGE,
-    PINK,
-    RED,
-    SKY,
-    interval,
-    save_column,
-    tidy,
-)
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import BLUE, GREY, INK, PINK, RED, SKY
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.methods.hybrid import POLISH, polished
+from jaxshape.search.reconstruction import reconstruct
+from jaxshape.search.refiner import Refiner, StopReason
+from study import (
     TUNED,
     Claim,
     Contestant,
@@ -54,11 +49,6 @@ from jaxshape.results.study import (
     groups,
     mean_interval,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods import build_refiner
-from jaxshape.search.methods.hybrid import POLISH, polished
-from jaxshape.search.reconstruction import reconstruct
-from jaxshape.search.refiner import Refiner, StopReason
 
 RESULTS = Path(__file__).parent / "results"
 

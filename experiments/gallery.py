@@ -25,18 +25,19 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from figures import save_column
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE, PINK, RED
+from jaxshape.report.pictures import render_measurement, render_voxels
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, observe
-from jaxshape.results.figures import BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, save_column
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import render_measurement, render_voxels
-from jaxshape.results.study import TUNED, Claim, Subject, TestSet, conclude, subjects
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct_jit, refiner_for
+from study import TUNED, Claim, Subject, TestSet, conclude, subjects
 
 RESULTS = Path(__file__).parent / "results"
 CREATORS = Path(__file__).with_name("cad_seats.json")

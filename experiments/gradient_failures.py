@@ -32,17 +32,20 @@ import tyro
 from jaxtyping import Array, Float
 from rich.progress import track
 
+from figures import PAGE, save_column
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
 from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
 from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.report.panels import grid_panel, measurement_panel
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
-from jaxshape.results.figures import PAGE, save_column
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import grid_panel, measurement_panel
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import reconstruct, refiner_for
+from jaxshape.search.residuals import LESS_FREE, cross_entropy, weigh
+from study import (
     TUNED,
     Claim,
     Subject,
@@ -52,9 +55,6 @@ from jaxshape.results.study import (
     subjects,
     tuned,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.reconstruction import reconstruct, refiner_for
-from jaxshape.search.residuals import LESS_FREE, cross_entropy, weigh
 
 RESULTS = Path(__file__).parent / "results"
 SHAPES = ("encoder", *TUNED)

@@ -14,25 +14,23 @@ Time: 50 minutes on two cores.
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
 
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
-from jaxshape.results.study import (
+from study import (
     Claim,
     TestSet,
     column,
     compare,
     conclude,
-    curves_by_frames,
     groups,
     mean_interval,
-    mean_low_high,
     measurement,
+    plot_curves,
+    summary,
     tuned,
 )
 
@@ -74,22 +72,8 @@ def run(config: Config) -> Journal:
     journal = Journal(config.results / "iou_by_frames.json", settings)
     contestants = tuned(prior, config.iterations) | {"F": measurement}
     compare(contestants, prior, config.test, config.frames, journal)
-    conclude(journal, claims(journal, config), summary=summary(journal, config))
+    conclude(journal, claims(journal, config), summary=summary(journal, config.frames))
     return journal
-
-
-def summary(journal: Journal, config: Config) -> dict[str, Any]:
-    """Mean and interval of every curve: `summary[group][curve][frames] = [mean, low, high]`."""
-    return {
-        group: {
-            name: {
-                str(k): mean_low_high(values)
-                for k, values in zip(config.frames, curves, strict=True)
-            }
-            for name, curves in curves_by_frames(journal, group, config.frames).items()
-        }
-        for group in groups(journal)
-    }
 
 
 def claims(journal: Journal, config: Config) -> list[Claim]:
@@ -164,22 +148,7 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
 
 def plot(journal: Journal, config: Config) -> None:
     """A panel for each group of chairs."""
-
-    def draw(figure: Any) -> None:
-        panels = figure.subplots(1, len(groups(journal)), sharey=True, squeeze=False)[0]
-        for axes, group in zip(panels, groups(journal), strict=True):
-            curves = curves_by_frames(journal, group, config.frames)
-            for name, curve in curves.items():
-                draw_mean(axes, config.frames, np.stack(curve, axis=1), label=name, **LINES[name])
-            axes.set(xscale="log", xlabel="frames", title=f"{len(curve[0])} {group} chairs")
-            axes.set_xticks(config.frames, [str(k) for k in config.frames])
-            axes.minorticks_off()
-            tidy(axes)
-        panels[0].set_ylabel("IoU")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
-
-    save_column(config.results / "iou_by_frames", draw, height=3.1, width=PAGE)
+    plot_curves(config.results / "iou_by_frames", journal, config.frames, "{} {} chairs")
 
 
 if __name__ == "__main__":

@@ -28,11 +28,13 @@ from rich.progress import track
 from jaxshape.data import meshes
 from jaxshape.data.split import hold_out
 from jaxshape.files import atomic_path
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
+from jaxshape.report.palette import COLORS
+from jaxshape.report.panels import Panel
+from jaxshape.report.pictures import render_mesh, render_voxels
 from jaxshape.results.evaluation import Case, EvaluateConfig, observe
-from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import COLORS, Panel, render_mesh, render_voxels
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
 

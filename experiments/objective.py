@@ -25,14 +25,21 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Bool, Float
 
+from figures import PAGE, interval, save_column
 from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import BLUE, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import BLUE, GREY, INK, ORANGE, PAGE, interval, save_column, tidy
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.reconstruction import code_penalty, compose, search_space
+from jaxshape.search.residuals import Weights, weigh
+from jaxshape.search.run import refine
+from study import (
     Claim,
     Contestant,
     TestSet,
@@ -44,11 +51,6 @@ from jaxshape.results.study import (
     mean_interval,
     mean_low_high,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods import build_refiner
-from jaxshape.search.reconstruction import code_penalty, compose, search_space
-from jaxshape.search.residuals import Weights, weigh
-from jaxshape.search.run import refine
 
 RESULTS = Path(__file__).parent / "results"
 

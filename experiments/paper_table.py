@@ -15,6 +15,8 @@ from typing import Any
 
 import tyro
 
+from jaxshape.files import write_text
+
 ROOT = Path(__file__).parents[1]
 BEGIN, END = "<!-- paper_table.py writes this -->\n", "<!-- until here -->\n"
 SCRIPTS = (
@@ -49,7 +51,7 @@ def main(config: Config) -> None:
     written = before + BEGIN + table(config.results) + END + after
     if config.check:
         sys.exit(written != text and "The README's table is not that of the results files.")
-    config.readme.write_text(written)
+    write_text(config.readme, written)
 
 
 def table(results: Path) -> str:

@@ -38,9 +38,11 @@ import jaxshape.data.chairs
 from jaxshape.data import meshes
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.chairs import random_chair
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
+from jaxshape.report.figures import save_figure
+from jaxshape.report.palette import BLUE, FAINT, GREEN, ORANGE
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -445,21 +447,13 @@ def nearest_neighbours(
 
 # ------------------------------------------------------------------ the figure
 
-# The palette of Okabe and Ito, whose colours the common kinds of colour blindness keep apart.
-STYLE = {"procedural": ("#E69F00", "-"), "CAD": ("#0072B2", "--"), "boxes": ("#009E73", "-.")}
-INK, FAINT = "#2B2F33", "#E3E6E8"
+STYLE = {"procedural": (ORANGE, "-"), "CAD": (BLUE, "--"), "boxes": (GREEN, "-.")}
 
 
 def plot(
     path: Path, results: dict[str, Any], sources: dict[str, Seats], ious: dict[str, np.ndarray]
 ) -> None:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    style: dict[Any, Any] = {"font.size": 9, "axes.titlesize": 9, "legend.fontsize": 8,
-                             "text.color": INK, "axes.edgecolor": INK}  # fmt: skip
-    with rc_context(style), atomic_path(path) as temporary:
-        figure = Figure(figsize=(10, 12), dpi=150, layout="constrained")
+    def draw(figure: Any) -> None:
         upper, lower = figure.subfigures(2, 1, height_ratios=[1, 1.2], hspace=0.02)
         left, right = upper.subfigures(1, 2, width_ratios=[1, 1])
         _plot_projections(left, sources)
@@ -467,7 +461,8 @@ def plot(
         _plot_parts(dots, results)
         _plot_nearest(curves, ious)
         _plot_statistics(lower, results, sources)
-        figure.savefig(temporary)
+
+    save_figure(path, (10, 12), draw, font=9.0)
 
 
 def _plot_projections(figure: Any, sources: dict[str, Seats]) -> None:
@@ -570,8 +565,7 @@ def main(config: Config) -> dict[str, Any] | None:
     start = time.perf_counter()
     results, sources, ious = run(config)
     results["seconds"] = round(time.perf_counter() - start)
-    with atomic_path(config.output) as temporary:
-        temporary.write_text(json.dumps(results, indent=1) + "\n")
+    write_json(config.output, results)
     plot(config.output.with_suffix(".png"), results, sources, ious)
     print(json.dumps(results["nearest neighbour IoU"], indent=1))
     return results

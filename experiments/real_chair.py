@@ -24,6 +24,7 @@ import numpy as np
 import trimesh
 import tyro
 
+from figures import save_column
 from jaxshape.data.boxes import Box, read_box
 from jaxshape.data.sequences import Sequence as Recording
 from jaxshape.data.sequences import open_sequence
@@ -36,14 +37,14 @@ from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.mapping.tracking.keyframes import Keyframe
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.results.figures import BLUE, INK, ORANGE, PINK, SKY, save_column
+from jaxshape.report.palette import BLUE, INK, ORANGE, PINK, SKY
+from jaxshape.report.pictures import render_measurement, render_voxels
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
-from jaxshape.results.pictures import render_measurement, render_voxels
-from jaxshape.results.study import Claim, conclude
 from jaxshape.results.surface import surface
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, refiner_for
+from study import Claim, conclude
 
 RESULTS = Path(__file__).parent / "results"
 WAYS = {"given": "poses given", "first": "first pose given, others tracked"}

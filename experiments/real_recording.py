@@ -29,7 +29,7 @@ import tyro
 
 from jaxshape.data.boxes import Box, read_box
 from jaxshape.data.sequences import Sequence, open_sequence
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import Mapper, build_mapper
 from jaxshape.mapping.map.recording import Progress, follow, trajectory
@@ -41,8 +41,9 @@ from jaxshape.mapping.tracking.registration import displacement
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
+from jaxshape.report.panels import Panel, grid_panel, write_panels
+from jaxshape.report.pictures import render_mesh
 from jaxshape.results.output import SMOOTHING
-from jaxshape.results.pictures import Panel, grid_panel, overview, render_mesh
 from jaxshape.results.surface import surface
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
@@ -71,8 +72,7 @@ class Config:
 
 def main(config: Config) -> None:
     metrics, meshes = run(replace(config, iterations=2) if config.smoke else config)
-    with atomic_path(config.results / "real_recording.json") as path:
-        path.write_text(json.dumps(metrics, indent=1))
+    write_json(config.results / "real_recording.json", metrics)
     plot(meshes, config.results / "real_recording.png")
     print(json.dumps(metrics["ways"], indent=1))
 
@@ -206,16 +206,7 @@ def _seconds(progress: Progress) -> dict[str, float]:
 
 def plot(meshes: dict[str, list[Panel]], path: Path) -> None:
     """The meshes from three sides, one row for each way."""
-    from PIL import Image
-
-    rows = []
-    for way, panels in meshes.items():
-        with atomic_path(path.with_name(f"{path.stem}-{way}.png")) as temporary:
-            overview(temporary, depth_frames=[], columns=panels)
-            rows.append(np.asarray(Image.open(temporary).convert("RGB")))
-        path.with_name(f"{path.stem}-{way}.png").unlink()
-    with atomic_path(path) as temporary:
-        Image.fromarray(np.concatenate(rows)).save(temporary)
+    write_panels(path, meshes.values())
 
 
 if __name__ == "__main__":

@@ -24,24 +24,20 @@ import optax
 import tyro
 from jaxtyping import Array
 
+from figures import PAGE, draw_mean, save_column
 from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.report.figures import tidy
+from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PAGE,
-    draw_mean,
-    save_column,
-    tidy,
-)
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import iou
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
+from jaxshape.search.reconstruction import reconstruct, refiner_for
+from jaxshape.search.refiner import Refiner
+from study import (
     Claim,
     Contestant,
     Scores,
@@ -50,10 +46,6 @@ from jaxshape.results.study import (
     conclude,
     mean_interval,
 )
-from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
-from jaxshape.search.reconstruction import reconstruct, refiner_for
-from jaxshape.search.refiner import Refiner
 
 RESULTS = Path(__file__).parent / "results"
 CASES_AT_A_TIME = 15

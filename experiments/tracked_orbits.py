@@ -36,15 +36,16 @@ from scipy.spatial.transform import Rotation
 from jaxshape.data import meshes
 from jaxshape.data.boxes import Box
 from jaxshape.data.capture import Capture, capture
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import camera
+from jaxshape.geometry.overlap import iou
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import Mapper, Step, build_mapper
 from jaxshape.mapping.tracking.keyframes import PreparedFrame
 from jaxshape.mapping.tracking.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
-from jaxshape.results.metrics import iou
+from jaxshape.report.palette import BLUE, FOG, INK, ORANGE, SKY
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
@@ -106,8 +107,7 @@ def run(config: Config) -> dict[str, Any]:
             done[futures[future]] = future.result()
             print(f"{number} of {len(missing)} seats", flush=True)
             metrics = {"settings": settings, "summary": summarize(done), "seats": done}
-            with atomic_path(path) as temporary:
-                temporary.write_text(json.dumps(metrics, indent=1))
+            write_json(path, metrics)
     return {"settings": settings, "summary": summarize(done), "seats": done}
 
 
@@ -239,7 +239,7 @@ def plot(metrics: dict[str, Any], path: Path) -> None:
     seats = list(metrics["seats"].values())
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     drift, shape = figure.subplots(1, 2)
-    colors = ["#B4BBC2", "#56B4E9", "#E69F00", "#0072B2", "#2B2F33"]
+    colors = [FOG, SKY, ORANGE, BLUE, INK]
     for system, color in zip(SYSTEMS, colors, strict=False):
         percent = [100 * s[system]["ate_mm"] / 1000 / s["diagonal"] for s in seats]
         share = np.arange(1, len(seats) + 1) / len(seats)

@@ -46,14 +46,14 @@ from jaxshape.data.dataset import (
 )
 from jaxshape.data.inputs import draw_pair
 from jaxshape.data.meshes import Model, Skipped
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.config import Architecture, TrainConfig
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.training import finished_prior, train
+from jaxshape.report.palette import COLORS
 from jaxshape.results.evaluation import EvaluateConfig, evaluate, summarize
-from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import COLORS
 from jaxshape.search.config import RefineConfig
 
 RESULTS = Path(__file__).parent / "results"
@@ -204,8 +204,7 @@ def run(config: Config) -> dict[str, Any]:
         found[name] = judge(prior, tests, faulty, config) | {
             "settings": asdict(settings), "samples": settings.steps * settings.batch
         }  # fmt: skip
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(found, indent=1))
+        write_json(path, found)
         print(line(name, found[name]), flush=True)
     return found
 

@@ -34,10 +34,9 @@ from jaxshape.geometry.grid import fit_box
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case
-from jaxshape.results.figures import LINES, PAGE, draw_mean, save_column, tidy
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds
-from jaxshape.results.study import (
+from study import (
     TUNED,
     Claim,
     Scores,
@@ -48,9 +47,10 @@ from jaxshape.results.study import (
     conclude,
     curves_by_frames,
     groups,
-    mean_low_high,
     measurement,
+    plot_curves,
     subjects,
+    summary,
     tuned,
 )
 
@@ -101,7 +101,9 @@ def run(config: Config) -> Journal:
     contestants["F"] = measured
     at_a_time = CHAIRS_AT_A_TIME * len(config.frames)
     compare(contestants, prior, chairs, config.frames, journal, at_a_time=at_a_time)
-    conclude(journal, claims(journal, config), summary=summary(journal, config))
+    inside = {group: _inside(journal, config, group) for group in groups(journal)}
+    found = summary(journal, config.frames, inside)
+    conclude(journal, claims(journal, config), summary=found)
     return journal
 
 
@@ -165,23 +167,6 @@ def measured(keys: Any, prior: ShapePrior, case: Case) -> Scores:
 
 
 # ------------------------------------------------------------------ what is found
-
-
-def summary(journal: Journal, config: Config) -> dict[str, Any]:
-    """Mean and interval of every curve: `summary[group][curve][frames] = [mean, low, high]`."""
-    return {
-        group: {
-            name: {
-                str(k): mean_low_high(values)
-                for k, values in zip(config.frames, curve, strict=True)
-            }
-            for name, curve in curves.items()
-        }
-        for group in groups(journal)
-        for curves in (
-            curves_by_frames(journal, group, config.frames) | _inside(journal, config, group),
-        )
-    }
 
 
 def _inside(journal: Journal, config: Config, group: str) -> dict[str, list[np.ndarray]]:
@@ -270,23 +255,8 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
 
 def plot(journal: Journal, config: Config) -> None:
     """A panel for each group of chairs."""
-
-    def draw(figure: Any) -> None:
-        panels = figure.subplots(1, len(groups(journal)), sharey=True, squeeze=False)[0]
-        for axes, group in zip(panels, groups(journal), strict=True):
-            curves = curves_by_frames(journal, group, config.frames)
-            for name, curve in curves.items():
-                draw_mean(axes, config.frames, np.stack(curve, axis=1), label=name, **LINES[name])
-            title = f"{len(curve[0])} voluminous {group} chairs"
-            axes.set(xscale="log", xlabel="frames", title=title)
-            axes.set_xticks(config.frames, [str(k) for k in config.frames])
-            axes.minorticks_off()
-            tidy(axes)
-        panels[0].set_ylabel("IoU")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
-
-    save_column(config.results / "voluminous", draw, height=3.1, width=PAGE)
+    title = "{} voluminous {} chairs"
+    plot_curves(config.results / "voluminous", journal, config.frames, title)
 
 
 if __name__ == "__main__":

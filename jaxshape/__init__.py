@@ -30,7 +30,8 @@ Data moves one way, and so do imports:
     model      convolutions, auto-encoder, weights, training
     search     objective (Eq. 7), refiners, the batched search, composed shapes
     mapping    segmentation, the object's frame, ICP, keyframes, realignment of a recording
-    results    surfaces, metrics, evaluation, pictures, files, report and live view
+    results    surfaces, metrics, evaluation, the files of a result
+    report     pictures, plots, the report page, the live view, the model card
     cli        the `jaxshape` command
 """
 

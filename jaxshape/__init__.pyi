@@ -6,6 +6,7 @@ from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.evidence import Grids, binary
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
+from .geometry.overlap import iou
 from .mapping.config import MappingConfig, TrackingConfig
 from .mapping.map.mapper import Mapper, build_mapper
 from .mapping.map.recording import Progress, follow, trajectory
@@ -16,8 +17,8 @@ from .mapping.tracking.keyframes import PreparedFrame
 from .model.config import Architecture
 from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
 from .model.weights import load_prior, save_prior
-from .results.metrics import bounds, chamfer_l1, f_score, iou, shape_scores
-from .results.report import write_report
+from .report.page import write_report
+from .results.metrics import bounds, chamfer_l1, f_score, shape_scores
 from .results.surface import surface, write_mesh
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
 from .search.config import RefineConfig

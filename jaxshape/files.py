@@ -1,10 +1,12 @@
 """Writing files so that a reader never finds half of one."""
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
@@ -29,6 +31,30 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text as UTF-8, atomically.
+
+    Args:
+        path: The file; its folder is made if missing.
+        text: All that the file will hold.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | os.PathLike[str], content: Any) -> None:
+    """Write JSON, indented, atomically.
+
+    Args:
+        path: The file; its folder is made if missing.
+        content: Dictionaries, lists, strings, numbers, booleans and None.
+
+    Raises:
+        TypeError: Where `content` holds something else, such as an array; nothing is written.
+    """
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def _mode_of(target: Path) -> int:

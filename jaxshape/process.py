@@ -1,7 +1,10 @@
 """Settings of a process that must stand before JAX computes, or is even imported. [host]"""
 
 import os
+import platform
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 
 def prepare_process() -> None:
@@ -58,6 +61,30 @@ def join_processes(
             "There seems to be no cluster that JAX knows, such as Slurm or Open MPI; "
             "give coordinator, processes and process by hand."
         ) from problem
+
+
+class Processor(NamedTuple):
+    """The machine's processor, as the system tells of it.
+
+    Attributes:
+        name: For people.
+        features: The instructions that it knows, such as `avx2`, `avx512f` and `amx_bf16`; empty
+            where the system does not tell.
+    """
+
+    name: str
+    features: frozenset[str]
+
+
+@cache
+def processor() -> Processor:
+    """The machine's processor, from /proc/cpuinfo where there is one."""
+    info = Path("/proc/cpuinfo")
+    first, _, _ = (info.read_text() if info.exists() else "").partition("\n\n")
+    lines = (line.split(":", 1) for line in first.splitlines() if ":" in line)
+    fields = {name.strip(): value.strip() for name, value in lines}
+    name = fields.get("model name") or platform.processor() or platform.machine()
+    return Processor(name, frozenset(fields.get("flags", "").split()))
 
 
 def _folder() -> Path | None:

@@ -29,8 +29,8 @@ from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model import training, weights
 from jaxshape.model.config import PRESETS
 from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prior
+from jaxshape.report.plots import plot_search
 from jaxshape.results import evaluation
-from jaxshape.results.plots import plot_search
 from jaxshape.results.traces import read_search
 from jaxshape.search.names import families
 

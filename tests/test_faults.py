@@ -26,7 +26,7 @@ from jaxshape.data.sequences import read_trajectory
 from jaxshape.geometry import fusion
 from jaxshape.mapping.map import mapper, recording
 from jaxshape.mapping.map.recording import trajectory
-from jaxshape.results import output, report
+from jaxshape.report import page, panels
 from jaxshape.results.progress import STATE
 
 TESTS = Path(__file__).parent
@@ -175,8 +175,8 @@ OPTIONS = ("--iterations", "3", "--keyframe-iterations", "2", "--min-hits", "1")
 @pytest.fixture
 def run(run, monkeypatch, known):
     """Run `reconstruct` in this process; returns its exit status, its answer and its complaint."""
-    monkeypatch.setattr(output, "draw", lambda *_: None)
-    monkeypatch.setattr(report, "write_report", lambda *_: None)
+    monkeypatch.setattr(panels, "write_overview", lambda *_: None)
+    monkeypatch.setattr(page, "write_report", lambda *_: None)
     return lambda folder, *options: run("reconstruct", folder, *OPTIONS, *options)
 
 
@@ -261,8 +261,8 @@ from known_shape import install
 from jaxshape.model.shapes import ShapePrior
 with np.load(sys.argv.pop(1)) as file:
     params = dict(file)
-from jaxshape.results import output, report
-output.draw = report.write_report = lambda *_: None
+from jaxshape.report import page, panels
+panels.write_overview = page.write_report = lambda *_: None
 code = len(params["waves"])
 install(setattr, ShapePrior(params, np.zeros(code, np.float32), np.eye(code, dtype=np.float32)))
 from jaxshape import cli

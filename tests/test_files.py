@@ -1,9 +1,10 @@
+import json
 import os
 import stat
 
 import pytest
 
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json, write_text
 
 
 def test_the_file_appears_whole_and_alone(tmp_path):
@@ -52,3 +53,19 @@ def test_permissions_are_those_of_an_ordinary_file_or_of_the_former_one(tmp_path
             temporary.write_text("text")
     assert stat.S_IMODE(fresh.stat().st_mode) == stat.S_IMODE(ordinary.stat().st_mode)
     assert stat.S_IMODE(former.stat().st_mode) == 0o640
+
+
+def test_text_and_json_are_read_back(tmp_path):
+    write_text(tmp_path / "new" / "name.txt", "Möbel 椅子\n")
+    assert (tmp_path / "new" / "name.txt").read_bytes() == "Möbel 椅子\n".encode()
+    content = {"name": "Möbel", "scores": [0.1, None, True], "frames": {"1": {}}}
+    write_json(tmp_path / "scores.json", content)
+    assert json.loads((tmp_path / "scores.json").read_text("ascii")) == content
+
+
+def test_what_json_does_not_know_leaves_the_former_file(tmp_path):
+    write_json(tmp_path / "scores.json", {"iou": 1})
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "scores.json", {"iou": 2, "grid": object()})
+    assert json.loads((tmp_path / "scores.json").read_text()) == {"iou": 1}
+    assert os.listdir(tmp_path) == ["scores.json"]

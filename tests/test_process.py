@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from jaxshape.process import keep_compiled
+from jaxshape import process
+from jaxshape.process import keep_compiled, processor
 
 FOLDER, SMALLEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
@@ -66,3 +67,39 @@ def test_without_its_own_variable_the_cache_lies_in_the_home(environment, tmp_pa
     environment["HOME"] = str(tmp_path)
     keep_compiled()
     assert environment[FOLDER] == str(tmp_path / ".cache" / "jaxshape" / "compiled")
+
+
+CPUINFO = """processor\t: 0
+model name\t: A processor @ 2.1GHz: fast
+flags\t\t: fpu avx2 amx_bf16
+
+processor\t: 1
+model name\t: Another
+flags\t\t: fpu
+"""
+
+
+@pytest.fixture
+def cpuinfo(tmp_path, monkeypatch):
+    """Where the system tells of its processor, in place of /proc/cpuinfo."""
+    path = tmp_path / "cpuinfo"
+    monkeypatch.setattr(process, "Path", lambda name: path)
+    processor.cache_clear()
+    yield path
+    processor.cache_clear()
+
+
+def test_the_processor_is_the_first_that_the_system_tells_of(cpuinfo):
+    cpuinfo.write_text(CPUINFO)
+    name, features = processor()
+    assert name == "A processor @ 2.1GHz: fast" and features == {"fpu", "avx2", "amx_bf16"}
+
+
+def test_where_the_system_tells_nothing_the_processor_has_a_name_and_no_features(cpuinfo):
+    name, features = processor()
+    assert name and features == set()
+
+
+def test_the_settings_of_a_process_are_made_without_jax():
+    code = "import sys, jaxshape.process; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -23,12 +23,12 @@ from tyro.conf import subcommand
 
 from jaxshape.cli.common import console
 from jaxshape.cli.inspecting import Inspect
-from jaxshape.cli.learning import Dataset, Train, preset_in
+from jaxshape.cli.learning import BuildDataset, Train, preset_in
 from jaxshape.cli.options import RefusedSetting, refusing, reworded
 from jaxshape.cli.rebuild import Demo
 from jaxshape.cli.recording import Reconstruct
 from jaxshape.cli.scoring import Evaluate, Plot
-from jaxshape.cli.viewing import View
+from jaxshape.cli.viewing import ViewResult
 from jaxshape.process import prepare_process
 
 
@@ -36,13 +36,13 @@ def commands(train: Train) -> Any:
     """The table of commands; `train` holds the defaults of its own."""
     return (
         Annotated[Demo, subcommand("demo")]
-        | Annotated[Dataset, subcommand("dataset")]
+        | Annotated[BuildDataset, subcommand("dataset")]
         | Annotated[Train, subcommand("train", default=train)]
         | Annotated[Reconstruct, subcommand("reconstruct")]
         | Annotated[Inspect, subcommand("inspect")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]
-        | Annotated[View, subcommand("view")]
+        | Annotated[ViewResult, subcommand("view")]
     )
 
 

@@ -16,7 +16,7 @@ from jaxshape.cli.common import console, progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Machines, checked_training
 from jaxshape.cli.scoring import load_models, score
 from jaxshape.data.config import DatasetConfig
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json, write_text
 from jaxshape.model.config import PRESETS, TrainConfig
 from jaxshape.search.config import RefineConfig
 
@@ -24,7 +24,7 @@ PROCESSORS = os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
-class Dataset:
+class BuildDataset:
     """Build training pairs: single views and complete surfaces, 4 KiB a grid.
 
     Examples: jaxshape dataset --output data/chairs
@@ -166,7 +166,7 @@ class Train:
         """Write the weights and cards of a finished run, and score it on what was held out."""
         from jaxshape.model.training import finished_prior, read_metrics
         from jaxshape.model.weights import load_prior, save_prior
-        from jaxshape.results.card import describe, training_card
+        from jaxshape.report.card import describe, training_card
         from jaxshape.results.evaluation import EvaluateConfig
 
         card = training_card(
@@ -179,7 +179,7 @@ class Train:
         )
         weights = output / f"{self.name}.safetensors"
         save_prior(weights, finished_prior(output, data, self.config), card)
-        _write_text(output / "card.json", json.dumps(card, indent=2))
+        write_json(output / "card.json", card)
         scores = None
         if held_out:
             config = EvaluateConfig(
@@ -190,7 +190,7 @@ class Train:
             settings = {"meshes": f"held out of {self.meshes}", "weights": str(weights)}
             prior = load_prior(weights)  # as it is used: in half precision
             scores = score(output / "evaluation.json", prior, config, settings, *held_out)
-        _write_text(output / f"{self.name}.md", describe(self.name, card, scores))
+        write_text(output / f"{self.name}.md", describe(self.name, card, scores))
         print(f"wrote {weights} and its card, {self.name}.md")
 
 
@@ -212,8 +212,3 @@ def _fit(output: Path, data: Any, config: TrainConfig, start: Any) -> bool:
             )
             bar.update(task, completed=report.step, note=note)
     return jax.process_index() == 0
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text)

@@ -83,8 +83,9 @@ class Demo(Rebuild):
         from jaxshape.data.chairs import random_chair
         from jaxshape.data.dataset import TEST_SEEDS
         from jaxshape.geometry import camera, fusion
+        from jaxshape.report.page import write_report
+        from jaxshape.report.panels import write_overview
         from jaxshape.results.output import Observation, write_result
-        from jaxshape.results.report import write_report
         from jaxshape.search.reconstruction import reconstruct_jit, require_measured
 
         require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
@@ -112,6 +113,7 @@ class Demo(Rebuild):
         figures |= self.settings() | {"seconds": round(time.perf_counter() - start, 2)}
         with console.status("drawing"):
             result = write_result(self.output, observation, found, figures)
+            write_overview(self.output, observation, found, result)
             write_report(self.output)
         report_objective(result)
         print(f"wrote mesh.glb, grid.npz, result.json, overview.png, report.html to {self.output}")

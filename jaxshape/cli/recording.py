@@ -174,13 +174,13 @@ class Reconstruct(Rebuild):
 
     def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
         """Draw what was found and say it."""
-        from jaxshape.results.output import draw
+        from jaxshape.report.page import write_report
+        from jaxshape.report.panels import write_overview
         from jaxshape.results.progress import observation_of
-        from jaxshape.results.report import write_report
 
         observation = observation_of(progress.state, self.mapping.min_hits)
         with console.status("drawing"):
-            draw(self.output, observation, progress.shape, result)
+            write_overview(self.output, observation, progress.shape, result)
             write_report(self.output)
         lost = result["frames_lost"] + result["frames_unreadable"]
         print(

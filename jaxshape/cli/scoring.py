@@ -1,6 +1,5 @@
 """`jaxshape evaluate` and `jaxshape plot`: how good results are, and how a search went."""
 
-import json
 import time
 import warnings
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from tyro.conf import Positional
 
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, checked_numbers
-from jaxshape.files import atomic_path
+from jaxshape.files import write_json
 from jaxshape.search.config import RefineConfig
 
 
@@ -133,38 +132,39 @@ def score(
     from jaxshape.data.meshes import Skipped
     from jaxshape.model.weights import fingerprint
     from jaxshape.results import evaluation
+    from jaxshape.results.journal import Journal
 
-    settings = json.dumps(asdict(config) | about | {"fingerprint": fingerprint(prior)})
-    per_mesh = evaluation.read_journal(output, settings)
-    scored = {scores["name"] for scores in per_mesh}
-    left = [model for model in models if model.name not in scored]
+    settings = asdict(config) | about
+    # Beside the results file until that is written.
+    partial = output.with_name(output.name + ".partial")
+    journal = Journal(partial, settings | {"fingerprint": fingerprint(prior)})
+    left = [model for model in models if model.name not in journal.rows]
     with progress_bar("meshes") as bar:
-        task = bar.add_task("evaluate", total=len(models), completed=len(scored), note="")
+        task = bar.add_task("evaluate", total=len(models), completed=len(journal.rows), note="")
         for scores in evaluation.evaluate(prior, left, config):
             if isinstance(scores, Skipped):
                 skipped = [*skipped, scores]
                 report_skipped([scores])
             else:
-                per_mesh.append(scores)
-                evaluation.write_journal(output, settings, per_mesh)
+                journal.add({scores["name"]: scores}, time.perf_counter() - start)
+                start = time.perf_counter()
             bar.update(task, advance=1)
-    require(bool(per_mesh), "No mesh could be scored; see the reasons above.")
-    seconds = round(time.perf_counter() - start, 1)
+    require(bool(journal.rows), "No mesh could be scored; see the reasons above.")
+    per_mesh = list(journal.rows.values())
     content = {
-        "config": asdict(config) | about | {"seconds": seconds},
+        "config": settings | {"seconds": round(journal.seconds, 1)},
         "skipped": [s._asdict() for s in skipped],
         "per_mesh": per_mesh,
         "means": evaluation.summarize(per_mesh, config),
     }
-    with atomic_path(output) as path:
-        path.write_text(json.dumps(content, indent=1))
-    evaluation.remove_journal(output)
+    write_json(output, content)
+    journal.remove()
     _print_table(content["means"], len(per_mesh))
     return content
 
 
 def _print_table(means: dict[str, Any], count: int) -> None:
-    from jaxshape.results.card import COLUMNS, rows_of
+    from jaxshape.report.card import COLUMNS, rows_of
 
     table = Table(title=f"means over {count} meshes", title_justify="left")
     for column in COLUMNS:
@@ -189,7 +189,7 @@ class Plot:
     """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder where not given."""
 
     def run(self) -> None:
-        from jaxshape.results.plots import compare_searches, plot_search
+        from jaxshape.report.plots import compare_searches, plot_search
         from jaxshape.results.traces import read_search
 
         require(bool(self.results), "Give one result folder or more.")

@@ -10,7 +10,7 @@ from jaxshape.cli.common import require
 
 
 @dataclass(frozen=True)
-class View:
+class ViewResult:
     """Show a result folder in the browser: the shape, grids and cameras, to turn and to switch on
     and off. While `jaxshape reconstruct` writes the folder, the picture follows.
 
@@ -35,7 +35,7 @@ class View:
             self.result.is_dir(),
             f"There is no folder {str(self.result)!r}; give one made by jaxshape reconstruct.",
         )
-        from jaxshape.results.viewer import view
+        from jaxshape.report.viewer import view
 
         def told(address: str) -> None:
             print(f"{address} shows {self.result}; Ctrl-C ends", flush=True)

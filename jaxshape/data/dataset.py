@@ -29,7 +29,7 @@ from jaxshape.data.capture import Capture, camera_distance, capture, measure_fra
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.config import DatasetConfig
 from jaxshape.data.meshes import Model, Skipped
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import camera, fusion
 from jaxshape.geometry.grid import RESOLUTION
 
@@ -155,8 +155,7 @@ def _write_shard(
     with atomic_path(_shard_path(folder, number, "npy")) as path:
         np.save(path, np.stack(grids) if grids else np.zeros(shape, np.uint8))
     # The names come last: a shard counts as written once they are there.
-    with atomic_path(_shard_path(folder, number, "json")) as path:
-        path.write_text(json.dumps({"names": names, "skipped": skipped}, indent=1))
+    write_json(_shard_path(folder, number, "json"), {"names": names, "skipped": skipped})
     return skipped
 
 
@@ -177,8 +176,7 @@ def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> No
                 "give another folder, or remove this one."
             )
         return
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(claim, indent=1))
+    write_json(path, claim)
 
 
 def _shard_path(folder: Path, number: int, suffix: str) -> Path:

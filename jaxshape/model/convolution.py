@@ -19,8 +19,7 @@ voxels `2 i + k - 2`, for taps `k` in 0..4 along each axis.
 
 import itertools
 from collections.abc import Callable
-from functools import cache, reduce
-from pathlib import Path
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +35,7 @@ from jaxshape.model.tiles import (
     transform_kernel,
     upsample_tiles,
 )
+from jaxshape.process import processor
 
 KERNEL_SIZE = 5
 CACHE_BYTES = 2 * 2**20
@@ -81,11 +81,9 @@ def prepare_kernel(kernel: Float[Array, "5 5 5 fine coarse"], side: int) -> Prep
     return PreparedKernel(kernel, transform_kernel(kernel) if tiled else None)
 
 
-@cache
 def multiplies_bfloat16() -> bool:
     """Whether the processor has matrix units for bfloat16 (AMX)."""
-    info = Path("/proc/cpuinfo")
-    return info.exists() and " amx_bf16" in info.read_text()
+    return "amx_bf16" in processor().features
 
 
 def upsample_prepared(

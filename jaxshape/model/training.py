@@ -30,8 +30,9 @@ from safetensors.numpy import save_file
 
 from jaxshape.data.dataset import Dataset
 from jaxshape.data.inputs import draw_pair
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_text
 from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import AUTOENCODER, AutoEncoder, architecture_of, initialize
 from jaxshape.model.config import TrainConfig
 from jaxshape.model.shapes import ShapePrior, encode
@@ -137,9 +138,8 @@ def train_step(
     (loss, (updates, completed)), gradients = jax.value_and_grad(loss_of, has_aux=True)(params)
     moves, optimizer = optimizer_for(config).update(over_all(gradients), state.optimizer, params)
     variables = {"params": optax.apply_updates(params, moves), **updates}
-    axes = (1, 2, 3)
-    iou = jnp.mean(jnp.sum(completed & surface, axes) / jnp.sum(completed | surface, axes))
-    return TrainState(state.step + 1, variables, optimizer), over_all((loss, iou))
+    figures = loss, jnp.mean(iou(completed, surface))
+    return TrainState(state.step + 1, variables, optimizer), over_all(figures)
 
 
 def _code_noise(step, count, config: TrainConfig, axis):
@@ -216,10 +216,10 @@ def train(
         state, outcome = step_fn(state, *batch)
         metrics.append(outcome)
         if (step + 1) % config.report_every == 0 or step + 1 == config.steps:
-            loss, iou = np.mean(jax.device_get(metrics), axis=0)
+            loss, overlap = np.mean(jax.device_get(metrics), axis=0)
             seconds = time.perf_counter() - began
             rate = config.batch * len(metrics) / seconds
-            report = Report(step + 1, float(loss), float(iou), rate, seconds)
+            report = Report(step + 1, float(loss), float(overlap), rate, seconds)
             if jax.process_index() == 0:
                 _record(folder, report)
                 save_checkpoint(folder, state, run)
@@ -316,5 +316,5 @@ def read_metrics(folder: str | os.PathLike[str]) -> list[Report]:
 def _record(folder: Path, report: Report) -> None:
     """Add a report to the metrics, in place of any from steps that a kill made to be repeated."""
     reports = [r for r in read_metrics(folder) if r.step < report.step] + [report]
-    with atomic_path(folder / "metrics.jsonl") as path:
-        path.write_text("".join(json.dumps(r._asdict()) + "\n" for r in reports))
+    lines = (json.dumps(r._asdict()) + "\n" for r in reports)
+    write_text(folder / "metrics.jsonl", "".join(lines))

@@ -1,9 +1,7 @@
 """Score refinement methods on meshes seen along an orbit (paper, section 4.1). [host]"""
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -14,10 +12,10 @@ from jaxtyping import Array, Bool, Key
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.dataset import hash_seed
 from jaxshape.data.meshes import Model, Skipped
-from jaxshape.files import atomic_path
 from jaxshape.geometry import camera, fusion
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
-from jaxshape.results.metrics import bounds, iou, shape_scores
+from jaxshape.results.metrics import bounds, shape_scores
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import (
     Reconstruction,
@@ -176,28 +174,3 @@ def summarize(per_mesh: Sequence[dict[str, Any]], config: EvaluateConfig) -> dic
         }
         for k in config.frames
     }
-
-
-# A long evaluation keeps its scores in a journal beside the results file until that is written.
-
-
-def read_journal(output: Path, settings: str) -> list[dict[str, Any]]:
-    """The scores that an evaluation under these settings had reached when it was killed."""
-    path = _journal(output)
-    content = json.loads(path.read_text()) if path.exists() else {}
-    return content["per_mesh"] if content.get("settings") == settings else []
-
-
-def write_journal(output: Path, settings: str, per_mesh: Sequence[dict[str, Any]]) -> None:
-    """Keep the scores reached so far."""
-    with atomic_path(_journal(output)) as path:
-        path.write_text(json.dumps({"settings": settings, "per_mesh": per_mesh}))
-
-
-def remove_journal(output: Path) -> None:
-    """Forget the scores reached so far, once the results file is written."""
-    _journal(output).unlink(missing_ok=True)
-
-
-def _journal(output: Path) -> Path:
-    return output.with_name(output.name + ".partial")

@@ -14,36 +14,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, UInt8
 
-from jaxshape.results.pictures import COLORS
-
-
-class Layer(NamedTuple):
-    """How one thing of the scene is called and drawn."""
-
-    label: str
-    color: str
-    shown: bool
-    """At first."""
-
-
-LAYERS = {
-    "mesh": Layer("mesh", COLORS["predicted"], True),
-    "occupied": Layer("measured (F)", COLORS["measured"], False),
-    "occluded": Layer("occluded (M)", COLORS["occluded"], False),
-    "encoder": Layer("prior (encoder)", "#CC79A7", False),
-    "refined": Layer("refined", "#D55E00", False),
-    "composed": Layer("composed", "#56B4E9", False),
-    "truth": Layer("truth", COLORS["truth"], False),
-    "cameras": Layer("keyframes", "#2B2F33", True),
-    "trajectory": Layer("trajectory", COLORS["measured"], True),
-}
-"""Everything that can be shown in 3D, in the palette of Okabe and Ito."""
-
 GRIDS = ("occupied", "occluded", "encoder", "refined", "composed", "truth")
 IMAGES = ("image", "depth", "mask")
 
 
-class Keyframe(NamedTuple):
+class KeyframeRecord(NamedTuple):
     """A fused frame; `None` for what is not known of it."""
 
     name: str
@@ -71,7 +46,7 @@ class ResultFolder(NamedTuple):
     """fx, fy, cx, cy in pixels."""
     shape: tuple[int, int] | None
     """Height and width of the frames."""
-    keyframes: list[Keyframe]
+    keyframes: list[KeyframeRecord]
     frames: list[dict[str, Any]]
     """Index, name, status and reason of every frame of the recording."""
     trajectory: Float[np.ndarray, "s 2 3"]
@@ -126,7 +101,7 @@ def mesh_in_object(found: ResultFolder) -> trimesh.Trimesh | None:
     return found.mesh and found.mesh.copy().apply_transform(found.T_object_world)
 
 
-def camera_poses(found: ResultFolder) -> list[tuple[Keyframe, Float[np.ndarray, "4 4"]]]:
+def camera_poses(found: ResultFolder) -> list[tuple[KeyframeRecord, Float[np.ndarray, "4 4"]]]:
     """The keyframes whose pose is known, each with its `T_object_camera`."""
     poses = ((k, k.T_world_camera) for k in found.keyframes)
     return [(k, found.T_object_world @ pose) for k, pose in poses if pose is not None]
@@ -153,7 +128,7 @@ def half_field_of_view(found: ResultFolder) -> tuple[float, float]:
     return w / (2 * fx), h / (2 * fy)
 
 
-def picture(keyframe: Keyframe, kind: str) -> UInt8[np.ndarray, "h w *c"] | Any | None:
+def picture(keyframe: KeyframeRecord, kind: str) -> UInt8[np.ndarray, "h w *c"] | Any | None:
     """The pixels of a keyframe's image, depth or mask, as stored; `None` where unreadable."""
     from PIL import Image
 
@@ -199,7 +174,7 @@ def _grids(path: Path) -> tuple[dict[str, Any], tuple[Any, ...]]:
     return grids, (*frame, T_world_object)
 
 
-def _keyframes(path: Path) -> tuple[list[Keyframe], list[dict[str, Any]], Any, Any]:
+def _keyframes(path: Path) -> tuple[list[KeyframeRecord], list[dict[str, Any]], Any, Any]:
     content, folder = _object(path), path.parent.resolve()
 
     def files(entry: dict[str, Any]) -> dict[str, Path]:
@@ -208,7 +183,7 @@ def _keyframes(path: Path) -> tuple[list[Keyframe], list[dict[str, Any]], Any, A
         return {k: p for k, p in named.items() if p.is_relative_to(folder) and p.is_file()}
 
     keyframes = [
-        Keyframe(
+        KeyframeRecord(
             str(entry.get("name", i)), pose_of(entry.get("T_world_camera")), files(entry), entry
         )
         for i, entry in enumerate(content.get("keyframes") or [])
@@ -231,7 +206,7 @@ def pose_of(value: Any) -> Float[np.ndarray, "4 4"] | None:
     return pose if pose.shape == (4, 4) and np.isfinite(pose).all() else None
 
 
-def _stand_in(keyframes: list[Keyframe]) -> tuple[Any, ...]:
+def _stand_in(keyframes: list[KeyframeRecord]) -> tuple[Any, ...]:
     """A frame to look from before the object's is known: cameras see y pointing down."""
     first = next((k.T_world_camera for k in keyframes if k.T_world_camera is not None), None)
     upright = np.eye(4) if first is None else first @ np.diag([1.0, -1.0, -1.0, 1.0])

@@ -4,11 +4,18 @@ import json
 from pathlib import Path
 from typing import Any
 
-from jaxshape.files import atomic_path
+from jaxshape.files import write_text
 
 
 class Journal:
-    """The rows of one results file, by name; rows made under other settings are not its own."""
+    """The rows of one results file, by name; rows made under other settings are not its own.
+
+    Attributes:
+        path: The file.
+        settings: What the rows were made under, as JSON has it.
+        rows: By name, in the order in which they came.
+        seconds: What they took together, over all runs.
+    """
 
     def __init__(self, path: Path, settings: dict[str, Any]):
         self.path = path
@@ -23,13 +30,16 @@ class Journal:
     def add(self, rows: dict[str, Any], seconds: float) -> None:
         """Write some rows and the seconds they took to the file, with all before them."""
         self.rows |= rows
-        self.seconds = round(self.seconds + seconds, 1)
+        self.seconds += seconds
         self.write({})
 
     def write(self, findings: dict[str, Any]) -> None:
         """Write the file anew, with what the rows say put before them."""
-        about = {"settings": self.settings, "seconds": self.seconds}
+        about = {"settings": self.settings, "seconds": round(self.seconds, 1)}
         content = json.dumps(about | findings, indent=1)[:-2]
         rows = ",\n".join(f"  {json.dumps(k)}: {json.dumps(v)}" for k, v in self.rows.items())
-        with atomic_path(self.path) as temporary:
-            temporary.write_text(f'{content},\n "rows": {{\n{rows}\n }}\n}}\n')
+        write_text(self.path, f'{content},\n "rows": {{\n{rows}\n }}\n}}\n')
+
+    def remove(self) -> None:
+        """Remove the file, where what the rows come to stands elsewhere."""
+        self.path.unlink(missing_ok=True)

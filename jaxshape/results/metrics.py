@@ -2,10 +2,11 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import KDTree
+
+from jaxshape.geometry.overlap import iou
 
 F_SCORE_THRESHOLD = 0.01
 """Distance up to which two points agree, as a fraction of the side of the grid's cube."""
@@ -13,20 +14,6 @@ F_SCORE_THRESHOLD = 0.01
 WORST_CHAMFER = 1.0
 """The Chamfer distance when one of two shapes is empty: a whole diagonal, so that means stay
 finite and a method cannot gain by predicting nothing."""
-
-
-def iou(
-    predicted: Bool[Array | np.ndarray, "*#batch x y z"],
-    truth: Bool[Array | np.ndarray, "*#batch x y z"],
-) -> Float[Array, "..."]:
-    """Intersection over union of the occupied voxels, between 0 and 1, one for each grid.
-
-    The true union, where the paper prints a sum (section 4): |A and B| / |A or B|. Two empty
-    grids agree: 1. Leading axes broadcast.
-    """
-    intersection = jnp.sum(predicted & truth, axis=(-3, -2, -1))
-    union = jnp.sum(predicted | truth, axis=(-3, -2, -1))
-    return jnp.where(union == 0, 1.0, intersection / jnp.maximum(union, 1))
 
 
 class Bounds(NamedTuple):

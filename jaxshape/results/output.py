@@ -1,6 +1,5 @@
-"""The files of one reconstruction: mesh, grids, trace, figures and a picture. [host]"""
+"""The files of one reconstruction: mesh, grids, trace and figures. [host]"""
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,13 +7,11 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import trimesh
 from jaxtyping import Array, Bool, Float
 
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.grid import GridFrame
-from jaxshape.results.metrics import iou
-from jaxshape.results.pictures import grid_panel, measurement_panel, mesh_panel, overview
+from jaxshape.geometry.overlap import iou
 from jaxshape.results.surface import surface, write_mesh
 from jaxshape.results.traces import write_trace
 from jaxshape.search.reconstruction import Reconstruction
@@ -25,16 +22,23 @@ SMOOTHING = 20
 
 
 class Observation(NamedTuple):
-    """What was measured of one object, and where its grid lies."""
+    """What was measured of one object, and where its grid lies.
+
+    Attributes:
+        depth: A few depth frames to show, in metres.
+        occupied: F.
+        occluded: M.
+        frame: Of the grid, in the object frame.
+        T_world_object: The object's pose.
+        truth: The complete surface, where it is known.
+    """
 
     depth: Sequence[Float[np.ndarray, "_ _"]]
-    """A few depth frames to show, in metres."""
     occupied: Bool[np.ndarray, "x y z"]
     occluded: Bool[np.ndarray, "x y z"]
     frame: GridFrame
     T_world_object: Float[np.ndarray, "4 4"]
     truth: Bool[np.ndarray, "x y z"] | None
-    """The complete surface, where it is known."""
 
 
 def write_result(
@@ -43,16 +47,24 @@ def write_result(
     reconstruction: Reconstruction,
     figures: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write `overview.png` and the files of `write_shape`, then `result.json`, of ONE object.
+    """Write the files of `write_shape`, then `result.json`, of ONE object.
 
-    `result.json` holds `figures`, the objective before and after, what the search took and why it
-    stopped, and the IoUs where the truth is known; it is returned.
+    Args:
+        folder: Where to write; made if missing.
+        observation: What was measured of the object.
+        reconstruction: What was found, a batch of one.
+        figures: What `result.json` holds besides, such as the settings.
+
+    Returns:
+        The content of `result.json`: `figures`, the objective before and after in nats per voxel,
+        what the search took and why it stopped, and the IoUs where the truth is known.
+
+    Raises:
+        ValueError: Where the composed shape is empty; nothing is written.
     """
     folder = Path(folder)
     result = write_shape(folder, observation, reconstruction, figures)
-    draw(folder, observation, reconstruction, result)
-    with atomic_path(folder / "result.json") as path:
-        path.write_text(json.dumps(result, indent=2))
+    write_json(folder / "result.json", result)
     return result
 
 
@@ -67,7 +79,7 @@ def write_shape(
     The mesh is the composed shape in the world frame, in metres. The trace has a row for each
     iteration of the search; there is none of the encoder alone.
     """
-    one = _only(reconstruction)
+    one = only(reconstruction)
     mesh = surface(
         one.composed,
         observation.frame,
@@ -84,14 +96,8 @@ def write_shape(
     return {**figures, **_searched(one), **_measured(observation, one)}
 
 
-def draw(
-    folder: Path, observation: Observation, reconstruction: Reconstruction, result: dict[str, Any]
-) -> None:
-    """Write `overview.png`."""
-    _draw(folder / "overview.png", observation, _only(reconstruction), result)
-
-
-def _only(reconstruction: Reconstruction) -> Any:
+def only(reconstruction: Reconstruction) -> Any:
+    """The only object of a batch of one, as NumPy arrays."""
     return jax.device_get(jax.tree.map(lambda x: x[0], reconstruction))
 
 
@@ -138,25 +144,3 @@ def _write_grids(path: Path, observation: Observation, one: Any) -> None:
         arrays["truth"] = observation.truth
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, **arrays)  # pyright: ignore[reportArgumentType]
-
-
-def _draw(path: Path, observation: Observation, one: Any, result: dict[str, Any]) -> None:
-    def note(name: str) -> str:
-        return f"IoU {result[name]:.2f}" if name in result else ""
-
-    composed = np.where(observation.occluded, 2 * one.composed, observation.occupied.astype(int))
-    columns = [
-        measurement_panel("F (blue) and M", observation.occupied, observation.occluded),
-        grid_panel("encoder", one.completed_first, "predicted", note=note("iou_encoder")),
-        grid_panel("refined", one.completed, "predicted", note=note("iou_refined")),
-        grid_panel("composed", composed, "measured", "predicted", note=note("iou_composed")),
-        _mesh_panel(observation, one),
-    ]
-    if observation.truth is not None:
-        columns.append(grid_panel("truth", observation.truth, "truth"))
-    overview(path, depth_frames=observation.depth, columns=columns)
-
-
-def _mesh_panel(observation: Observation, one: Any):
-    mesh: trimesh.Trimesh = surface(one.composed, observation.frame, smoothing=SMOOTHING)
-    return mesh_panel("mesh", mesh, "predicted")

@@ -11,6 +11,7 @@ Every file is replaced at once, when the new one is whole, so that `jaxshape vie
 """
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -28,7 +29,7 @@ from jaxshape.data.sequences import (
     Trajectory,
     write_trajectory,
 )
-from jaxshape.files import atomic_path
+from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import fusion
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.map.state import MapState, assemble
@@ -72,8 +73,8 @@ def write_progress(
         result["running"] = True
     if progress.shape is not None:
         result = write_shape(folder, observation, progress.shape, result)
-    _write_json(folder / "keyframes.json", _keyframes(sequence, progress))
-    _write_json(folder / "result.json", result)
+    write_json(folder / "keyframes.json", _keyframes(sequence, progress))
+    write_json(folder / "result.json", result)
     return result
 
 
@@ -115,13 +116,15 @@ def _crop(depth: np.ndarray, segmented: np.ndarray) -> np.ndarray:
 # Keyframes and poses ----------------------------------------------------------------------------
 
 
-def _keyframe_logs(progress: Progress) -> list[FrameLog]:
-    return [log for log in progress.logs if log.status == "keyframe"]
+def _fused(progress: Progress) -> Iterator[tuple[FrameLog, Keyframe]]:
+    """What became of each keyframe, and what the map keeps of it."""
+    logs = (log for log in progress.logs if log.status == "keyframe")
+    return zip(logs, progress.state.keyframes, strict=True)
 
 
 def _write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> None:
     """Colour, depth and mask of each keyframe, at working size; those that are there stay."""
-    for log, keyframe in zip(_keyframe_logs(progress), progress.state.keyframes, strict=True):
+    for log, keyframe in _fused(progress):
         segmented = np.asarray(keyframe.segmented)
         _write_image(folder / f"{log.name}.mask.png", segmented.astype(np.uint8) * 255)
         if (folder / f"{log.name}.depth.png").exists():
@@ -154,9 +157,10 @@ def _keyframes(sequence: Sequence, progress: Progress) -> dict[str, Any]:
                 "mask": f"keyframes/{log.name}.mask.png",
                 **({"image": f"keyframes/{log.name}.jpg"} if sequence.files[log.index].color
                    else {}),
+                "object_pixels": int(np.sum(keyframe.segmented)),
                 **log.figures,
             }
-            for log in _keyframe_logs(progress)
+            for log, keyframe in _fused(progress)
         ],
         "frames": [_frame_entry(log, poses) for log in progress.logs],
     }  # fmt: skip
@@ -180,11 +184,6 @@ def _write_trajectory(folder: Path, sequence: Sequence, progress: Progress) -> N
     found = Trajectory(np.stack([poses[i] for i in index]), index, times)
     write_trajectory(folder / "trajectory.txt", found)
     write_trajectory(folder / "trajectory.log", found)
-
-
-def _write_json(path: Path, content: Any) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1))
 
 
 # The checkpoint ---------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from jaxshape.results.folder import Keyframe, ResultFolder
+from jaxshape.results.folder import KeyframeRecord, ResultFolder
 
 
 class Figure(NamedTuple):
@@ -27,8 +27,8 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
     if "objective_refined" in result:
         before, after = (number(result.get(f"objective_{n}"), 4) for n in ("encoder", "refined"))
         meaning = (
-            "nats per observed voxel: cross-entropy with F outside M (Eq. 7), of the encoder’s "
-            "code, then of the refined one; lower is better"
+            f"nats per voxel of the whole grid ({_minimised(result)}), of the encoder’s code, then "
+            "of the refined one; lower is better"
         )
         yield Figure("Objective", f"{before} → {after}", meaning)
     if "iou_composed" in result:
@@ -53,7 +53,19 @@ def warnings_of(found: ResultFolder) -> list[str]:
     return [*([given] if isinstance(given, str) else map(str, given)), *unused, *found.problems]
 
 
-def tracked(keyframe: Keyframe) -> str:
+def _minimised(result: dict[str, Any]) -> str:
+    """What the search minimised, in words."""
+    search = result.get("search")
+    name = str(search["objective"]) if isinstance(search, dict) and "objective" in search else ""
+    words = {
+        "": "Eq. 7 or a variant of it",
+        "paper": "Eq. 7 as printed",
+        "balanced": "Eq. 7, where measured free space counts a third",
+    }
+    return words.get(name, f"the objective {name}")
+
+
+def tracked(keyframe: KeyframeRecord) -> str:
     """How well a keyframe's pose is known."""
     inliers, rmse = keyframe.figures.get("inlier_fraction"), keyframe.figures.get("rmse")
     agree = number(inliers, 0, times=100.0, unit=" % inliers")

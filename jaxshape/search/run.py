@@ -10,9 +10,15 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from jaxshape.geometry.evidence import Grids
 from jaxshape.model.shapes import Precision, ShapePrior, pick
-from jaxshape.search.batching import select
 from jaxshape.search.objective import Evaluation, Penalty, evaluation, prepare_one
-from jaxshape.search.refiner import Objective, Refiner, StopReason, Trace, finite_or_inf
+from jaxshape.search.refiner import (
+    Objective,
+    Refiner,
+    StopReason,
+    Trace,
+    advance,
+    finite_or_inf,
+)
 from jaxshape.search.residuals import BALANCED, Residual
 from jaxshape.search.space import LatentSpace, raw
 
@@ -106,11 +112,7 @@ def refine(
         return refiner.resume(key, state, loss)
 
     def move(key, state, own, trace):
-        """One iteration of one object; nothing where its search has stopped."""
-        loss, running = loss_of(own), state.stop == StopReason.RUNNING
-        awake = lambda point: loss(jnp.where(running, point, jnp.nan))  # noqa: E731
-        moved = refiner.step(key, state, awake)
-        state, trace = select(running, moved, (state, trace))
+        state, trace = advance(refiner, key, state, trace, loss_of(own))
         return _stop_at(target_loss, state), trace
 
     def iterate(carry, number):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments import cad_seats
-from experiments.cad_seats import Seat, collect, read_list
+import cad_seats
+from cad_seats import Seat, collect, read_list
 from jaxshape.data.meshes import Model, read_meshes
 
 CATALOGUE = """

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from experiments.cad_seats import read_list
-from experiments.gallery import at_percentiles, credit
-from jaxshape.results.study import Subject
+from cad_seats import read_list
+from gallery import at_percentiles, credit
+from study import Subject
 
 
 def test_chairs_are_those_at_the_percentiles():

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from experiments import mugs
+import mugs
 
 
 @pytest.fixture(scope="module", params=range(6))

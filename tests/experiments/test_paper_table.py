@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.paper_table import BEGIN, END, Config, main, table
+from paper_table import BEGIN, END, Config, main, table
 
 CLAIM = {"figure": "Fig. 1", "claim": "a | b", "ours": "1", "holds": "yes"}
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments import procedural_vs_real as experiment
+import procedural_vs_real as experiment
 
 
 def box(low, high):

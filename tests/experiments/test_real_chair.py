@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from orbit_recording import write_recording
 
-from experiments import real_chair
+import real_chair
 from jaxshape.process import prepare_process
 
 

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 
-from experiments.voluminous import solid, voluminous
-from jaxshape.results.study import TestSet
+from study import TestSet
+from voluminous import solid, voluminous
 
 
 def test_solids_are_surfaces_with_their_holes_filled():

@@ -5,13 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.model.autoencoder import (
-    AutoEncoder,
-    architecture_of,
-    decode,
-    encode,
-    initialize,
-)
+from jaxshape.model.autoencoder import AutoEncoder, architecture_of, initialize
 from jaxshape.model.config import Architecture
 from jaxshape.model.weights import flatten
 

@@ -11,10 +11,10 @@ from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.dataset import TEST_SEEDS
 from jaxshape.geometry import camera, fusion
-from jaxshape.model.autoencoder import architecture_of, decode, encode
+from jaxshape.geometry.overlap import iou
+from jaxshape.model.autoencoder import architecture_of
 from jaxshape.model.config import Architecture
 from jaxshape.model.weights import load_card, load_prior
-from jaxshape.results.metrics import iou
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 

@@ -12,7 +12,6 @@ from jaxshape.model.autoencoder import initialize
 from jaxshape.model.config import Architecture
 from jaxshape.model.weights import (
     FORMAT,
-    ShapePrior,
     WeightsError,
     fingerprint,
     load_card,

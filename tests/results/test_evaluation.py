@@ -11,18 +11,16 @@ import trimesh
 
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.meshes import Model
+from jaxshape.geometry.overlap import iou
 from jaxshape.results import evaluation
 from jaxshape.results.evaluation import (
     EvaluateConfig,
     by_each_method,
     evaluate,
     observe,
-    read_journal,
-    remove_journal,
     summarize,
-    write_journal,
 )
-from jaxshape.results.metrics import bounds, iou
+from jaxshape.results.metrics import bounds
 from jaxshape.search.config import RefineConfig
 
 CONFIG = EvaluateConfig((1, 2), refine=RefineConfig(iterations=2, population=4), seed=3)
@@ -155,13 +153,3 @@ def test_what_methods_have_in_common_is_computed_once(linear_prior):
 def test_an_unknown_method_is_refused_before_anything_is_compiled(linear_prior):
     with pytest.raises(ValueError, match="no method 'magic'"):
         by_each_method(linear_prior, replace(CONFIG, methods=("encoder", "magic")))
-
-
-def test_a_journal_gives_back_what_was_scored_under_the_same_settings_only(tmp_path, scores):
-    path = tmp_path / "scores.json"
-    assert read_journal(path, "settings") == []
-    write_journal(path, "settings", scores[:2])
-    assert read_journal(path, "settings") == scores[:2]
-    assert read_journal(path, "others") == []
-    remove_journal(path)
-    assert read_journal(path, "settings") == []

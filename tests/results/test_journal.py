@@ -33,3 +33,14 @@ def test_findings_stand_before_the_rows_and_do_not_cost_them(tmp_path):
 def test_a_journal_without_rows_can_be_read(tmp_path):
     Journal(tmp_path / "study.json", SETTINGS).write({})
     assert Journal(tmp_path / "study.json", SETTINGS).rows == {}
+
+
+def test_many_short_rows_take_time_too_and_a_removed_journal_is_empty(tmp_path):
+    journal = Journal(tmp_path / "study.json", SETTINGS)
+    for i in range(10):
+        journal.add({str(i): {}}, 0.04)
+    again = Journal(journal.path, SETTINGS)
+    assert len(again.rows) == 10 and again.seconds == 0.4
+    again.remove()
+    again.remove()
+    assert Journal(journal.path, SETTINGS).rows == {} and not list(tmp_path.iterdir())

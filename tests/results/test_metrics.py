@@ -3,14 +3,7 @@ import pytest
 import trimesh
 from scipy.spatial.distance import cdist
 
-from jaxshape.results.metrics import (
-    boundary_points,
-    bounds,
-    chamfer_l1,
-    f_score,
-    iou,
-    shape_scores,
-)
+from jaxshape.results.metrics import boundary_points, bounds, chamfer_l1, f_score, shape_scores
 from jaxshape.results.surface import voxel_surface
 
 
@@ -22,31 +15,6 @@ def box(lower, upper, resolution=32):
     grid = np.zeros((resolution,) * 3, bool)
     grid[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))] = True
     return grid
-
-
-@pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
-def test_iou_is_that_of_the_sets_of_voxels(batch):
-    a, b = random_grids(*batch, 4, 5, 6), random_grids(*batch, 4, 5, 6, seed=1)
-    expected = [
-        len(p & t) / len(p | t)
-        for p, t in zip(
-            *([set(np.flatnonzero(grid)) for grid in x.reshape(-1, 120)] for x in (a, b)),
-            strict=True,
-        )
-    ]
-    np.testing.assert_allclose(iou(a, b), np.reshape(expected, batch), rtol=1e-6)
-
-
-def test_iou_broadcasts_and_ends_at_its_limits():
-    truth = random_grids(4, 4, 4)
-    predicted = np.stack([truth, ~truth, np.zeros_like(truth)])
-    np.testing.assert_array_equal(iou(predicted, truth), [1, 0, 0])
-    assert iou(np.zeros_like(truth), np.zeros_like(truth)) == 1
-
-
-def test_iou_of_overlapping_boxes():
-    a, b = box((0, 0, 0), (4, 4, 4)), box((2, 0, 0), (6, 4, 4))
-    assert float(iou(a, b)) == pytest.approx(32 / 96)
 
 
 def test_bounds_are_named_after_what_occluded_voxels_are_set_to():

@@ -6,51 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from made_result import T_WORLD_OBJECT, observation, reconstruction, solid
 
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.geometry.overlap import iou
 from jaxshape.results import output
-from jaxshape.results.metrics import iou
-from jaxshape.results.output import Observation, write_result
+from jaxshape.results.output import write_result
 from jaxshape.results.traces import read_trace
-from jaxshape.search.reconstruction import Reconstruction, compose
-from jaxshape.search.refiner import StopReason, Trace
-
-T_WORLD_OBJECT = np.array([[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]], float)
-
-
-def solid(lower, upper):
-    grid = np.zeros((32, 32, 32), bool)
-    grid[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))] = True
-    return grid
-
 
 OCCUPIED, OCCLUDED = solid((4, 4, 4), (8, 28, 28)), solid((8, 4, 4), (28, 28, 28))
 COMPLETED, FIRST = solid((4, 4, 4), (20, 28, 28)), solid((4, 4, 4), (12, 28, 28))
 TRUTH = solid((4, 4, 4), (24, 28, 28))
-OBSERVATION = Observation(
-    depth=[np.full((20, 30), 1.5, np.float32)],
-    occupied=OCCUPIED,
-    occluded=OCCLUDED,
-    frame=GridFrame(jnp.array([-0.32, -0.64, -0.32]), jnp.array([0.02, 0.04, 0.02])),
-    T_world_object=T_WORLD_OBJECT,
-    truth=TRUTH,
-)
-RECONSTRUCTION = Reconstruction(
-    first_code=jnp.zeros((1, 10)),
-    code=jnp.arange(10.0)[None],
-    completed_first=jnp.asarray(FIRST)[None],
-    logits=jnp.where(COMPLETED, 1.0, -1.0)[None],
-    completed=jnp.asarray(COMPLETED)[None],
-    composed=compose(jnp.asarray(OCCUPIED), jnp.asarray(OCCLUDED), jnp.asarray(COMPLETED))[None],
-    first_objective=jnp.array([0.5]),
-    objective=jnp.array([0.25]),
-    # Stopped after three of five iterations, and constant from then on.
-    trace=Trace(*(jnp.array([[5.0, 4, 3, 3, 3]]),) * 3, jnp.array([[11, 21, 31, 31, 31]])),
-    path=jnp.zeros((1, 5, 10)),
-    iterations=jnp.array([3]),
-    stop=jnp.array([StopReason.TOLX]),
-)
+FRAME = GridFrame(jnp.array([-0.32, -0.64, -0.32]), jnp.array([0.02, 0.04, 0.02]))
+OBSERVATION = observation(OCCUPIED, OCCLUDED, TRUTH, FRAME)
+RECONSTRUCTION = reconstruction(OBSERVATION, FIRST, COMPLETED, steps=5)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +30,7 @@ def written(tmp_path_factory):
 
 def test_the_files_are_there_and_nothing_else(written):
     names = {path.name for path in written[0].iterdir()}
-    files = {"mesh.glb", "mesh.ply", "grid.npz", "trace.npz", "overview.png", "result.json"}
+    files = {"mesh.glb", "mesh.ply", "grid.npz", "trace.npz", "result.json"}
     assert names == files
 
 
@@ -98,8 +67,7 @@ def test_the_trace_ends_where_the_search_did(written):
     np.testing.assert_array_equal(trace.best_loss, [5, 4, 3])
 
 
-def test_the_encoder_alone_leaves_no_trace_of_an_earlier_search(tmp_path, monkeypatch):
-    monkeypatch.setattr(output, "overview", lambda *args, **settings: None)
+def test_the_encoder_alone_leaves_no_trace_of_an_earlier_search(tmp_path):
     (tmp_path / "trace.npz").write_bytes(b"earlier")
     alone = RECONSTRUCTION._replace(trace=None, iterations=None, stop=None)
     result = write_result(tmp_path, OBSERVATION, alone, {})
@@ -117,13 +85,7 @@ def test_the_mesh_is_closed_and_lies_in_the_world(written):
     np.testing.assert_allclose(mesh.volume, 16 * 24 * 24 * 0.02 * 0.04 * 0.02, rtol=0.1)
 
 
-def test_the_picture_is_one(written):
-    with Image.open(written[0] / "overview.png") as picture:
-        assert min(picture.size) > 100 and np.ptp(np.asarray(picture)) > 100
-
-
-def test_without_the_truth_no_iou_is_claimed(tmp_path, monkeypatch):
-    monkeypatch.setattr(output, "overview", lambda *args, **settings: None)
+def test_without_the_truth_no_iou_is_claimed(tmp_path):
     result = write_result(tmp_path, OBSERVATION._replace(truth=None), RECONSTRUCTION, {})
     assert not any(name.startswith("iou") for name in result)
     with np.load(tmp_path / "grid.npz") as grids:
@@ -132,16 +94,14 @@ def test_without_the_truth_no_iou_is_claimed(tmp_path, monkeypatch):
 
 def test_a_failure_leaves_the_earlier_result_and_no_debris(tmp_path, monkeypatch):
     (tmp_path / "result.json").write_text("earlier")
-    (tmp_path / "overview.png").write_bytes(b"earlier")
 
     def fail(*args, **settings):
         raise OSError("disk full")
 
-    monkeypatch.setattr(output, "overview", fail)
+    monkeypatch.setattr(output, "write_trace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_result(tmp_path, OBSERVATION, RECONSTRUCTION, {})
     assert (tmp_path / "result.json").read_text() == "earlier"
-    assert (tmp_path / "overview.png").read_bytes() == b"earlier"
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 

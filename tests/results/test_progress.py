@@ -14,7 +14,9 @@ from jaxshape.data.sequences import SequenceError, open_sequence, read_trajector
 from jaxshape.mapping.map.recording import follow, trajectory
 from jaxshape.mapping.placement.finding import find_start
 from jaxshape.mapping.segmentation.segment import Prompt
+from jaxshape.report.tables import COLUMNS, keyframe_table
 from jaxshape.results import progress as module
+from jaxshape.results.folder import read_folder
 from jaxshape.results.progress import (
     STATE,
     counts,
@@ -144,11 +146,30 @@ def test_every_frame_is_listed_with_what_became_of_it(written, steps, walk):
             np.testing.assert_allclose(T, poses[frame["index"]])
     assert content["shape"] == list(walk.depth.shape[1:])
     for keyframe in content["keyframes"]:
+        with Image.open(folder / keyframe["mask"]) as image:
+            assert keyframe["object_pixels"] == np.count_nonzero(image) > 100
         with Image.open(folder / keyframe["depth"]) as image:
             millimetres = np.asarray(image)
         expected = walk.depth[keyframe["index"]]
         np.testing.assert_array_equal(millimetres, expected)
         assert (folder / keyframe["mask"]).is_file() and "image" not in keyframe
+
+
+def test_the_report_has_a_column_for_every_figure_of_a_keyframe(written):
+    """But for what tells which frame it is, and where its pictures lie."""
+    folder, _ = written
+    keyframes = json.loads((folder / "keyframes.json").read_text())["keyframes"]
+    figures = {name for keyframe in keyframes for name in keyframe}
+    figures -= {"index", "name", "status", "reason", "T_world_camera", "depth", "mask"}
+    assert figures <= {column.figure for column in COLUMNS}
+    assert {"inlier_fraction", "rmse", "seconds_track", "seconds_fuse"} < figures
+    first, *others = keyframe_table(read_folder(folder).keyframes).split("<tr><td>")[1:]
+    assert len(others) == len(keyframes) - 1 > 1
+    assert "<td></td>" in first  # nothing was there to track it against
+    of_others = set.intersection(*map(set, keyframes[1:])) & figures
+    for row in others:
+        cells = row.split("</tr>")[0].split("</td><td>")[1:]
+        assert len(cells) == len(figures) and len(list(filter(None, cells))) >= len(of_others)
 
 
 def test_trajectories_can_be_read_back(written, steps):

@@ -11,19 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from jaxshape.model.autoencoder import decode
 from jaxshape.search import objective as module
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
-from jaxshape.search.objective import (
-    BALANCED,
-    PAPER,
-    Target,
-    Weights,
-    cross_entropy,
-    objective,
-    target,
-)
+from jaxshape.search.objective import BALANCED, PAPER, objective
 from jaxshape.search.run import refine
 
 SHAPE = (4, 3, 5)

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
-from jaxshape.results.metrics import iou
+from jaxshape.geometry.overlap import iou
 from jaxshape.search import reconstruction
 from jaxshape.search.config import RefineConfig
-from jaxshape.search.objective import PAPER, cross_entropy, target
+from jaxshape.search.objective import PAPER
 from jaxshape.search.reconstruction import (
     code_penalty,
     compose,

@@ -9,7 +9,6 @@ import pytest
 
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
-from jaxshape.search.objective import cross_entropy, target
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.run import refine
 from jaxshape.search.space import LatentSpace

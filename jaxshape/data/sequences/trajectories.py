@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxshape.data.sequences.frames import SequenceError
 from jaxshape.data.sequences.poses import check_rigid, is_rigid, number
-from jaxshape.files import atomic_path
+from jaxshape.files import write_text
 
 
 class Trajectory(NamedTuple):
@@ -78,8 +78,7 @@ def write_trajectory(
         text = _json_text(trajectory, camera)
     else:
         text = _log_text(trajectory) if suffix == ".log" else _tum_text(trajectory)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text)
+    write_text(path, text)
 
 
 # TUM -------------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ from jaxshape.mapping.tracking.keyframes import (
     keyframe_of,
     place_of,
 )
-from jaxshape.model.weights import ShapePrior
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct_jit
 from jaxshape.search.refiner import Refiner

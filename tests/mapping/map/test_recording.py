@@ -21,13 +21,13 @@ from jaxshape.data.boxes import read_box
 from jaxshape.data.sequences import SequenceError, open_sequence
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
+from jaxshape.geometry.overlap import iou
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.placement import finding
 from jaxshape.mapping.placement.finding import Start, find_start
 from jaxshape.mapping.placement.placing import Placement
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.mapping.tracking.keyframes import place_of
-from jaxshape.results.metrics import iou
 
 FEW, NOTHING_SAID = 5, Prompt()
 

@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxshape.report.palette import LAYERS
+from jaxshape.report.panels import Panel, depth_panels, grid_panel, measurement_panel
+from jaxshape.report.pictures import render_mesh
 from jaxshape.results.folder import (
-    LAYERS,
-    Keyframe,
+    KeyframeRecord,
     ResultFolder,
     camera_poses,
     extent,
@@ -20,13 +22,6 @@ from jaxshape.results.folder import (
     mesh_in_object,
     picture,
     thumbnail,
-)
-from jaxshape.results.pictures import (
-    Panel,
-    depth_panels,
-    grid_panel,
-    measurement_panel,
-    render_mesh,
 )
 
 _WIDTH = 320  # pixels of a keyframe's pictures
@@ -45,7 +40,7 @@ class Picture(NamedTuple):
 
 
 def scene(found: ResultFolder) -> dict[str, Any]:
-    """What report.js draws: layers in the object frame, and where to look.
+    """What page.js draws: layers in the object frame, and where to look.
 
     Numbers travel as base64 of their little-endian bytes; grids as bits, 4 KiB each, of which the
     page makes cubes itself.
@@ -149,7 +144,7 @@ def _grid_panel(title: str, name: str, have: dict[str, Any], note: str) -> Panel
     return grid_panel(title, have[name], "predicted", note=note)
 
 
-def keyframes(chosen: Sequence[Keyframe]) -> list[list[Picture]]:
+def keyframes(chosen: Sequence[KeyframeRecord]) -> list[list[Picture]]:
     """Colour with the object's outline, and depth, of each keyframe; what is there of them."""
     depths = [_depth(keyframe) for keyframe in chosen]
     panels = iter(depth_panels([depth for depth in depths if depth is not None]))
@@ -166,7 +161,7 @@ def keyframes(chosen: Sequence[Keyframe]) -> list[list[Picture]]:
     return pictured
 
 
-def _depth(keyframe: Keyframe) -> Float[np.ndarray, "h w"] | None:
+def _depth(keyframe: KeyframeRecord) -> Float[np.ndarray, "h w"] | None:
     stored = picture(keyframe, "depth")
     return None if stored is None else thumbnail(stored, _WIDTH).astype(np.float32) / 1000
 
@@ -191,7 +186,7 @@ def _outlined(image: UInt8[np.ndarray, "h w 3"], mask: Any) -> UInt8[np.ndarray,
 
 def convergence(folder: Path) -> Picture | None:
     """The course of the last search, drawn by `plot_search`; `None` where none was kept."""
-    from jaxshape.results.plots import plot_search
+    from jaxshape.report.plots import plot_search
     from jaxshape.results.traces import read_search
 
     try:

@@ -10,27 +10,15 @@ import numpy as np
 import pytest
 from browser import opened_browser
 from PIL import Image
-from result_folder import KEYFRAMES, change_json, write_folder, write_json
+from result_folder import KEYFRAMES, change_json, write_json
 
 from jaxshape.cli import common, viewing
 
 pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
-from jaxshape.results import viewer
-from jaxshape.results.viewer import LiveView, view
+from jaxshape.report import viewer
+from jaxshape.report.viewer import LiveView, view
 
 GRIDS = {"/occupied", "/occluded", "/encoder", "/refined", "/composed", "/truth"}
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("made") / "result"
-    write_folder(folder)
-    return folder
-
-
-@pytest.fixture
-def folder(made, tmp_path):
-    return shutil.copytree(made, tmp_path / "result")
 
 
 @pytest.fixture
@@ -167,9 +155,9 @@ def test_a_browser_shows_the_scene(folder, open_view):
 
 def test_what_is_missing_is_told_in_a_sentence(folder, tmp_path, monkeypatch):
     with pytest.raises(common.BadInput, match="no folder"):
-        viewing.View(tmp_path / "none").run()
+        viewing.ViewResult(tmp_path / "none").run()
     with pytest.raises(common.BadInput, match="--port"):
-        viewing.View(folder, port=0).run()
+        viewing.ViewResult(folder, port=0).run()
     monkeypatch.setattr(viewing, "find_spec", lambda name: None)
     with pytest.raises(common.BadInput, match=r"pip install 'jaxshape\[viewer\]'"):
-        viewing.View(folder).run()
+        viewing.ViewResult(folder).run()

@@ -5,7 +5,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxshape.results.figures import BLUE, COLUMN, draw_mean, interval, save_column
+from figures import COLUMN, draw_mean, interval, save_column
+from jaxshape.report.palette import BLUE
 
 SAMPLES = np.random.default_rng(0).normal([0.0, 5.0], [1.0, 0.1], (200, 2))
 

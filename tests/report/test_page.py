@@ -12,37 +12,24 @@ import numpy as np
 import pytest
 import trimesh
 from browser import opened_browser
+from made_result import T_WORLD_OBJECT
 from PIL import Image
 from result_folder import (
+    INSIDE,
     KEYFRAMES,
     OCCLUDED,
     OCCUPIED,
     STATUSES,
     T_OBJECT_CAMERA,
-    T_WORLD_OBJECT,
     TRUTH,
     change_json,
-    write_folder,
     write_json,
 )
 
-from jaxshape.results import illustrations, plots
-from jaxshape.results.report import write_report
+from jaxshape.report import illustrations, plots
+from jaxshape.report.page import write_report
 
 FILES = ("mesh.glb", "grid.npz", "trace.npz", "keyframes.json", "result.json")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("made") / "result"
-    write_folder(folder)
-    return folder
-
-
-@pytest.fixture
-def folder(made, tmp_path):
-    """A copy to spoil."""
-    return shutil.copytree(made, tmp_path / "result")
 
 
 @pytest.fixture
@@ -137,15 +124,33 @@ def test_the_figures_are_told_with_their_units(page):
         f"{KEYFRAMES} of {len(STATUSES)}",
         "2 tracked, 1 lost, 1 unreadable",
         "0.5000 → 0.2500",
-        "nats per observed voxel",
+        "nats per voxel of the whole grid (Eq. 7, where measured free space counts a third)",
         "12.3 s",
         "87 % inliers, 4.2 mm",
         "only 12 % agree",
         "1 of 7 frames were lost",
     ):
         assert text in page.text, text
-    for cell in ("0.4567", "0.789", "0.11", "0.22", "1.33", "31.5"):
-        assert f"<td>{cell}</td>" in page.html, cell
+
+
+def test_the_keyframe_table_tells_what_was_written_of_each(page):
+    row = ("frame-2", INSIDE.sum(), "87", "64", "4.2", "0.0315", "0.11", "0.22", "1.33")
+    assert "<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" in page.html
+    assert "realign, s" not in page.text  # no keyframe has it
+
+
+@pytest.mark.parametrize(
+    "search, words",
+    [
+        ({"objective": "paper"}, "(Eq. 7 as printed)"),
+        ({"objective": "robust"}, "(the objective robust)"),
+        ({}, "(Eq. 7 or a variant of it)"),
+    ],
+)
+@pytest.mark.usefixtures("quick")
+def test_the_objective_is_said_in_words(folder, search, words):
+    change_json(folder / "result.json", search=search)
+    assert f"nats per voxel of the whole grid {words}" in report(folder).text
 
 
 @pytest.mark.usefixtures("quick")

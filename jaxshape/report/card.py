@@ -16,6 +16,7 @@ import jax
 from jaxshape.model import weights
 from jaxshape.model.config import TrainConfig
 from jaxshape.model.training import Report
+from jaxshape.process import processor
 
 COLUMNS = ("frames", "method", "IoU", "IoU composed", "Chamfer-L1", "F-score", "objective")
 
@@ -78,17 +79,9 @@ def markdown_table(means: dict[str, Any]) -> str:
 def hardware() -> str:
     """The devices and versions that this process computes with."""
     kinds = Counter(device.device_kind for device in jax.devices())
-    cores = f"{os.cpu_count()} CPU cores ({_processor()})"
+    cores = f"{os.cpu_count()} CPU cores ({processor().name})"
     devices = ", ".join(cores if k == "cpu" else f"{count} x {k}" for k, count in kinds.items())
     return f"{devices}, Python {platform.python_version()}, jax {jax.__version__}"
-
-
-def _processor() -> str:
-    """The name of the processor, where the system tells."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def describe(name: str, card: dict[str, Any], scores: dict[str, Any] | None = None) -> str:

@@ -1,13 +1,14 @@
 """Plots of searches: how losses fell, and what became of the distribution, as pycma draws them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxshape.results.figures import BLUE, CYCLE, GREEN, INK, ORANGE, save_figure, tidy
+from jaxshape.report.figures import save_figure, tidy
+from jaxshape.report.palette import BLUE, CYCLE, GREEN, INK, ORANGE
 from jaxshape.results.traces import Search, restarts
 from jaxshape.search.refiner import Distribution, Trace
 
@@ -73,31 +74,6 @@ def compare_searches(path: str | Path, searches: Sequence[Search]) -> None:
         axes.legend(frameon=False)
 
     _save(path, (5.6, 4.0), searches, draw)
-
-
-def convergence(
-    path: str | Path, traces: Mapping[str, Float[np.ndarray, "_ _"]], *, label: str = "objective"
-) -> None:
-    """Plot the mean of objective by iteration, and the middle 80 % of the objects as a band.
-
-    Each trace is indexed by object and iteration; there may be one per refiner, and none need be
-    as long as another.
-    """
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        for (name, trace), color in zip(traces.items(), _cycle(traces), strict=True):
-            iteration = np.arange(trace.shape[1])
-            low, high = np.percentile(trace, (10, 90), axis=0)
-            axes.fill_between(iteration, low, high, color=color, alpha=0.15, linewidth=0)
-            axes.plot(iteration, trace.mean(axis=0), color=color, linewidth=1.8, label=name)
-        axes.set_xlabel("iteration")
-        axes.set_ylabel(label)
-        tidy(axes)
-        if len(traces) > 1:
-            axes.legend(frameon=False)
-
-    _save(path, (5.6, 3.6), [], draw)
 
 
 # ------------------------------------------------------------------ the panels of one search

@@ -1,32 +1,27 @@
-"""Pictures of grids, meshes and depth images, on white, for reports and the README.
+"""Pictures of grids and meshes, on white.
 
 Objects are drawn orthographically with +y up. `azimuth` is 0 in front of the object (+z) and grows
 towards its +x side, as for the cameras; `elevation` grows upwards; both are in degrees.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Integer, UInt8
 
-from jaxshape.files import atomic_path
-from jaxshape.results.figures import BLUE, GREEN, INK, ORANGE
+from jaxshape.report.palette import COLORS
 
 AZIMUTH, ELEVATION = 35.0, 25.0
-
-COLORS = {"measured": BLUE, "predicted": ORANGE, "truth": GREEN, "occluded": "#B4BBC2"}
 
 _SUPERSAMPLING = 2  # pixels averaged along each axis, to smooth edges
 _MARGIN = 1.02  # room around the object, as a factor of its extent
 _LIGHT = np.array([-0.35, 0.8, 0.5]) / np.linalg.norm([-0.35, 0.8, 0.5])  # right, up, towards us
 _AMBIENT = 0.68
-_PALE = "#F1F3F4"
 
 
-def _rgb(color: str) -> Float[np.ndarray, " 3"]:
+def rgb(color: str) -> Float[np.ndarray, " 3"]:
+    """The parts of a colour `#rrggbb`, between 0 and 1."""
     return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
 
 
@@ -71,7 +66,7 @@ def render_voxels(
     view = _view(azimuth, elevation)
     pixels = size * _SUPERSAMPLING
     pixels_per_voxel = pixels / (_MARGIN * (np.abs(view[:2]) @ labels.shape).max())
-    palette = np.stack([_rgb(color) for color in colors])
+    palette = np.stack([rgb(color) for color in colors])
     canvas = np.ones((pixels, pixels, 3))
     nearest = np.full((pixels, pixels), -np.inf)
     for axis in (axis for axis in range(3) if abs(view[2, axis]) > 1e-6):  # not those edge-on
@@ -180,12 +175,6 @@ def render_measurement(
     return np.rint(0.5 * solid + 0.5 * fog).astype(np.uint8)
 
 
-def draw_voxels(ax: Any, labels: Any, colors: Sequence[str] = (COLORS["predicted"],)) -> None:
-    """Show `render_voxels` of a grid on a matplotlib axes."""
-    ax.imshow(render_voxels(labels, colors, size=512))
-    ax.axis("off")
-
-
 # Meshes ----------------------------------------------------------------------------------------
 
 
@@ -221,115 +210,5 @@ def render_mesh(
     normals = np.einsum("nk,nkd->nd", corners, mesh.vertex_normals[mesh.faces[faces]]) @ view.T
     normals *= np.where(normals[:, 2:] < 0, -1, 1)  # open surfaces are seen from either side
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    canvas[rays] = _rgb(color) * _brightness(normals)[:, None]
+    canvas[rays] = rgb(color) * _brightness(normals)[:, None]
     return _to_image(canvas.reshape(pixels, pixels, 3))
-
-
-# Whole pictures --------------------------------------------------------------------------------
-
-
-class Panel(NamedTuple):
-    """One picture of a row, with a title above it and a note below it."""
-
-    title: str
-    image: UInt8[np.ndarray, "h w 3"]
-    note: str = ""
-
-
-def grid_panel(
-    title: str,
-    labels: Integer[np.ndarray, "x y z"] | Bool[np.ndarray, "x y z"],
-    *colors: str,
-    note: str = "",
-) -> Panel:
-    """Picture a grid, its labels 1, 2, ... in the given entries of `COLORS`."""
-    return Panel(title, render_voxels(labels, [COLORS[c] for c in colors], size=_CELL), note)
-
-
-def measurement_panel(
-    title: str,
-    occupied: Bool[np.ndarray, "x y z"],
-    occluded: Bool[np.ndarray, "x y z"],
-    note: str = "",
-) -> Panel:
-    """Picture F in colour, and M as a fog through which the F behind it shows."""
-    return Panel(title, render_measurement(occupied, occluded, size=_CELL), note)
-
-
-def mesh_panel(title: str, mesh: trimesh.Trimesh, color: str, note: str = "") -> Panel:
-    """Picture a mesh in an entry of `COLORS`."""
-    return Panel(title, render_mesh(mesh, color=COLORS[color], size=_CELL), note)
-
-
-def depth_panels(depth_frames: Sequence[Float[np.ndarray, "_ _"]]) -> list[Panel]:
-    """Picture depth images, near ones dark, with one scale for all.
-
-    Depth is in metres; 0 (invalid) is grey, infinity (background) pale.
-    """
-    from matplotlib import colormaps
-
-    known = [depth[np.isfinite(depth) & (depth > 0)] for depth in depth_frames]
-    metres = np.concatenate([*known, [] if any(map(len, known)) else [1.0]])
-    low, high = np.percentile(metres, (1, 99)) + (-1e-3, 1e-3)  # a flat wall has a scale, too
-    panels = []
-    for number, depth in enumerate(depth_frames, start=1):
-        image = colormaps["viridis"](0.95 * (depth - low) / (high - low))[..., :3]
-        image[np.isinf(depth)] = _rgb(_PALE)
-        image[~(depth > 0)] = _rgb(COLORS["occluded"])
-        panels.append(Panel(f"depth {number}", np.rint(image * 255).astype(np.uint8)))
-    return panels
-
-
-_WIDTH, _GAP, _TEXT, _CELL = 1600, 16, 34, 400  # pixels
-
-
-def overview(
-    path: str | Path,
-    *,
-    depth_frames: Sequence[Float[np.ndarray, "_ _"]],
-    columns: Sequence[Panel],
-    caption: str = "",
-) -> None:
-    """Write the picture of one reconstruction, 1600 pixels wide.
-
-    The depth images are above, the columns (grids, meshes) below them, then the caption.
-    """
-    from matplotlib.figure import Figure  # slow to import, and only pictures need it
-
-    rows = [row for row in (depth_panels(depth_frames), columns) if row]
-    heights = [_row_height(row) for row in rows]
-    noted = [_TEXT * any(panel.note for panel in row) for row in rows]
-    lines = _TEXT * (caption.count("\n") + 1) if caption else 0
-    total = sum(heights) + sum(noted) + len(rows) * (_TEXT + _GAP) + lines + _GAP
-    figure = Figure(figsize=(_WIDTH / 100, total / 100), dpi=100)
-    top = _GAP
-    for row, height, note in zip(rows, heights, noted, strict=True):
-        _draw_row(figure, row, top / total, height / total)
-        top += _TEXT + height + note + _GAP
-    if caption:
-        figure.text(0.5, 1 - top / total, caption, ha="center", va="top", fontsize=15, color=INK)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary)
-
-
-def _row_height(row: Sequence[Panel]) -> int:
-    """Height in pixels at which the panels of a row, none above 300 tall, share the width."""
-    aspect = sum(panel.image.shape[1] / panel.image.shape[0] for panel in row)
-    return int(min(300, (_WIDTH - _GAP * (len(row) + 1)) / max(aspect, 1e-6)))
-
-
-def _draw_row(figure: Any, row: Sequence[Panel], top: float, height: float) -> None:
-    """Draw panels side by side in the middle; lengths are fractions of the height of the figure."""
-    total = figure.get_figheight() * figure.dpi
-    widths = [height * total / p.image.shape[0] * p.image.shape[1] / _WIDTH for p in row]
-    gap, line = _GAP / _WIDTH, _TEXT / total
-    left = (1 - sum(widths) - gap * (len(row) - 1)) / 2
-    for panel, width in zip(row, widths, strict=True):
-        axes = figure.add_axes((left, 1 - top - line - height, width, height))
-        axes.imshow(panel.image, aspect="auto", interpolation="antialiased")
-        axes.axis("off")
-        middle = left + width / 2
-        style = {"ha": "center", "va": "center", "color": INK}
-        figure.text(middle, 1 - top - line / 2, panel.title, fontsize=16, weight="bold", **style)
-        figure.text(middle, 1 - top - 1.5 * line - height, panel.note, fontsize=15, **style)
-        left += width + gap

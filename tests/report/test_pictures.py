@@ -4,39 +4,14 @@ import sys
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from pixels import drawn, grid_of
 
-from jaxshape.results.pictures import (
-    COLORS,
-    depth_panels,
-    draw_voxels,
-    grid_panel,
-    measurement_panel,
-    mesh_panel,
-    overview,
-    render_mesh,
-    render_voxels,
-)
-
-
-def grid_of(*cells, n=32):
-    grid = np.zeros((n, n, n), bool)
-    for cell in cells:
-        grid[cell] = True
-    return grid
-
-
-def drawn(image):
-    return np.any(image < 250, axis=-1)
+from jaxshape.report.pictures import render_mesh, render_voxels
 
 
 def middle(mask):
     """Row and column of the centre of what is drawn."""
     return np.argwhere(mask).mean(axis=0)
-
-
-def rgb(color):
-    return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)])
 
 
 # Grids
@@ -160,68 +135,6 @@ def test_a_mesh_without_faces_is_white():
     assert (render_mesh(trimesh.Trimesh(), size=32) == 255).all()
 
 
-# Whole pictures
-
-
-def test_depth_panels_share_a_scale_and_show_what_is_unknown():
-    first = np.linspace(1, 3, 200, dtype=np.float32).reshape(10, 20)
-    second = np.full((10, 20), 2, np.float32)
-    second[0], second[1] = 0, np.inf
-    one, two = (panel.image.astype(int) for panel in depth_panels([first, second]))
-    near, far = one[0, 2], one[-1, -3]
-    assert near.sum() < far.sum()
-    at_two_metres = one.reshape(-1, 3)[np.abs(first - 2).argmin()]
-    assert np.abs(two[5, 5] - at_two_metres).max() <= 3
-    np.testing.assert_array_equal(two[0, 0], rgb(COLORS["occluded"]))
-    assert (two[1] > 235).all()
-
-
-@pytest.mark.parametrize("value", [0, np.inf, 2])
-def test_a_depth_image_of_one_value_is_one_colour(value):
-    (panel,) = depth_panels([np.full((6, 8), value, np.float32)])
-    assert panel.image.shape == (6, 8, 3)
-    assert len(np.unique(panel.image.reshape(-1, 3), axis=0)) == 1
-
-
-def test_fog_covers_only_what_is_occluded():
-    occupied, occluded = grid_of((8, 16, 16)), grid_of((24, 16, 16))
-    image = measurement_panel("F, M", occupied, occluded).image.astype(int)
-    alone = render_voxels(occupied, [COLORS["measured"]], size=len(image)).astype(int)
-    fog = drawn(image) & ~drawn(alone)
-    assert fog.any() and np.ptp(image[fog], axis=1).max() < 20  # grey
-    np.testing.assert_array_equal(image[drawn(alone)], alone[drawn(alone)])
-
-
-@pytest.mark.parametrize("frames, aspect", [(0, 1), (1, 1), (4, 4 / 3), (9, 4 / 3)])
-def test_an_overview_is_1600_wide_and_whole(tmp_path, frames, aspect):
-    depth = [np.full((30, round(30 * aspect)), 1 + i, np.float32) for i in range(frames)]
-    grid = np.random.default_rng(0).random((32, 32, 32)) < 0.05
-    columns = [
-        grid_panel("measured", grid, "measured"),
-        grid_panel("composed", grid.astype(int) * 2, "measured", "predicted", note="IoU 0.5"),
-        mesh_panel("mesh", trimesh.creation.box(), "truth"),
-    ]
-    path = tmp_path / "overview.png"
-    overview(path, depth_frames=depth, columns=columns, caption="a caption")
-    with Image.open(path) as image:
-        pixels = np.array(image.convert("RGB"))
-    assert pixels.shape[1] == 1600 and 300 < len(pixels) < 900
-    assert [file.name for file in tmp_path.iterdir()] == ["overview.png"]
-    edges = [pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]]
-    assert all((edge == 255).all() for edge in edges)  # nothing is cut off
-    first = path.read_bytes()
-    overview(path, depth_frames=depth, columns=columns, caption="a caption")
-    assert path.read_bytes() == first
-
-
-def test_draw_voxels_shows_the_picture_alone():
-    from matplotlib.figure import Figure
-
-    axes = Figure().add_subplot()
-    draw_voxels(axes, grid_of((1, 2, 3)))
-    assert not axes.axison and len(axes.images) == 1
-
-
 def test_importing_the_module_leaves_matplotlib_alone():
-    code = "import sys, jaxshape.results.pictures; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, jaxshape.report.pictures; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

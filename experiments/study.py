@@ -16,14 +16,16 @@ import numpy as np
 from jaxtyping import Array, Key, Num
 from rich.progress import Progress, TimeElapsedColumn
 
+from figures import LINES, PAGE, draw_mean, interval, save_column
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
 from jaxshape.data.meshes import Skipped
+from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
+from jaxshape.report.figures import tidy
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
-from jaxshape.results.figures import interval
 from jaxshape.results.journal import Journal
-from jaxshape.results.metrics import bounds, iou
+from jaxshape.results.metrics import bounds
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct, refiner_for
 
@@ -256,6 +258,56 @@ def curves_by_frames(
         "F, occluded empty": of("F", "occluded_empty"),
         "F, occluded full": of("F", "occluded_full"),
     }
+
+
+def summary(
+    journal: Journal,
+    frames: Sequence[int],
+    more: Mapping[str, Mapping[str, list[np.ndarray]]] | None = None,
+) -> dict[str, Any]:
+    """Mean and interval of every curve: `summary[group][curve][frames] = [mean, low, high]`.
+
+    Args:
+        journal: The rows.
+        frames: Numbers of frames, one for each value of a curve.
+        more: Curves besides those of `curves_by_frames`, by group and name.
+    """
+    curves = {group: curves_by_frames(journal, group, frames) for group in groups(journal)}
+    return {
+        group: {
+            name: {str(k): mean_low_high(x) for k, x in zip(frames, curve, strict=True)}
+            for name, curve in (of_group | dict((more or {}).get(group, {}))).items()
+        }
+        for group, of_group in curves.items()
+    }
+
+
+def plot_curves(stem: Path, journal: Journal, frames: Sequence[int], title: str) -> None:
+    """Draw the curves by numbers of frames, a panel for each group of chairs.
+
+    Args:
+        stem: Of the files, .png and .svg.
+        journal: The rows.
+        frames: Numbers of frames.
+        title: Of a panel, with places for the number of chairs and the name of their group.
+    """
+
+    def draw(figure: Any) -> None:
+        panels = figure.subplots(1, len(groups(journal)), sharey=True, squeeze=False)[0]
+        for axes, group in zip(panels, groups(journal), strict=True):
+            curves = curves_by_frames(journal, group, frames)
+            for name, curve in curves.items():
+                draw_mean(axes, frames, np.stack(curve, axis=1), label=name, **LINES[name])
+            count = len(next(iter(curves.values()))[0])
+            axes.set(xscale="log", xlabel="frames", title=title.format(count, group))
+            axes.set_xticks(frames, [str(k) for k in frames])
+            axes.minorticks_off()
+            tidy(axes)
+        panels[0].set_ylabel("IoU")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
+
+    save_column(stem, draw, height=3.1, width=PAGE)
 
 
 def groups(journal: Journal) -> list[str]:

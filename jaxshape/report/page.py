@@ -1,6 +1,6 @@
 """`report.html`: a whole result on one page that needs no network and no other file. [host]
 
-The page turns the shape with some 300 lines of WebGL of its own (report.js, 11 kB). The three.js in
+The page turns the shape with some 300 lines of WebGL of its own (page.js, 11 kB). The three.js in
 trimesh's notebook viewer is 700 kB of minified script from 2022, and has no layers to switch.
 """
 
@@ -8,29 +8,20 @@ import base64
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
-from itertools import groupby
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from jaxshape.files import atomic_path
-from jaxshape.results import illustrations
-from jaxshape.results.folder import LAYERS, Keyframe, ResultFolder, read_folder
-from jaxshape.results.illustrations import Picture
-from jaxshape.results.summary import headline, number, tracked, warnings_of
+from jaxshape.files import write_text
+from jaxshape.report import illustrations, tables
+from jaxshape.report.illustrations import Picture
+from jaxshape.report.palette import LAYERS
+from jaxshape.results.folder import ResultFolder, read_folder
+from jaxshape.results.summary import headline, tracked, warnings_of
 
 KEYFRAMES_TO_SHOW = 12
-
-STATUS_COLORS = {
-    "keyframe": "#0072B2",
-    "tracked": "#56B4E9",
-    "lost": "#D55E00",
-    "unreadable": "#CC79A7",
-    "skipped": "#B4BBC2",
-}
-"""In the palette of Okabe and Ito, as all pictures."""
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
@@ -40,7 +31,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     warnings. All text that comes from the folder is escaped. `ValueError` for no folder.
     """
     found = read_folder(folder)
-    script = _beside("report.js")
+    script = _beside("page.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     scene = illustrations.scene(found)
     sections = [
@@ -49,10 +40,10 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
         _grids(found),
         _keyframes(found),
         _convergence(Path(folder)),
-        _frames(found),
-        _all_figures(found),
+        tables.frame_strip(found),
+        tables.all_figures(found),
     ]
-    page = Template(_beside("report.html")).substitute(
+    page = Template(_beside("page.html")).substitute(
         title=escape(str(found.result.get("object", found.name))),
         subtitle=escape(_subtitle(found)),
         running=" · still running" if found.result.get("running") else "",
@@ -64,8 +55,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
         script_hash=f"sha256-{digest}",  # nothing else may run
     )
     target = Path(folder) / "report.html"
-    with atomic_path(target) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(target, page)
     return target
 
 
@@ -144,7 +134,7 @@ def _keyframes(found: ResultFolder) -> str:
     some = f" {shown} of {count} are pictured." if shown < count else ""
     return (
         f'<section><h2>Keyframes</h2><p class="soft">{about}{some}</p>'
-        f'<div class="pictures">{figures}</div></section>{_keyframe_table(found.keyframes)}'
+        f'<div class="pictures">{figures}</div></section>{tables.keyframe_table(found.keyframes)}'
     )
 
 
@@ -161,84 +151,3 @@ def _figure(pictures: Sequence[Picture], title: str, note: str) -> str:
 
 def _img(picture: Picture) -> str:
     return f'<img src="{picture.uri}" alt="{escape(picture.description)}">'
-
-
-# ------------------------------------------------------------------ tables
-
-
-def _keyframe_table(keyframes: Sequence[Keyframe]) -> str:
-    heading = ("keyframe", "inliers, %", "rmse, mm", "conditioning", "objective", "IoU")
-    steps = ("track", "fuse", "refine")
-    rows = []
-    for keyframe in keyframes:
-        of, seconds = keyframe.figures, keyframe.figures.get("seconds")
-        seconds = seconds if isinstance(seconds, dict) else {}
-        rows.append(
-            (
-                escape(keyframe.name),
-                number(of.get("inlier_fraction"), 0, times=100.0),
-                number(of.get("rmse"), 1, times=1000.0),
-                number(of.get("conditioning"), 1),
-                number(of.get("objective"), 4),
-                number(of.get("iou"), 3),
-                *(number(seconds.get(step), 2) for step in steps),
-            )
-        )
-    table = _table((*heading, *(f"{step}, s" for step in steps)), rows)
-    return (
-        f"<section><details><summary>Figures of each keyframe</summary>{table}</details></section>"
-    )
-
-
-def _frames(found: ResultFolder) -> str:
-    """A strip with a colour for each frame, and the runs of frames that fared alike."""
-    if not found.frames:
-        return ""
-    fared = lambda frame: (str(frame.get("status")), str(frame.get("reason") or ""))  # noqa: E731
-    runs, rows, start = [], [], 0
-    for (status, reason), run in groupby(found.frames, fared):
-        names = [str(frame.get("name", frame.get("index"))) for frame in run]
-        color = STATUS_COLORS.get(status, "#999999")
-        runs.append(
-            f'<rect x="{start}" y="0" width="{len(names)}" height="1" fill="{color}">'
-            f"<title>{escape(names[0])}: {escape(status)}</title></rect>"
-        )
-        extent = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
-        rows.append((escape(extent), str(len(names)), escape(status), escape(reason)))
-        start += len(names)
-    present = {status for _, _, status, _ in rows}
-    legend = "".join(
-        f'<span><i style="background:{color}"></i> {status}</span>'
-        for status, color in STATUS_COLORS.items()
-        if status in present
-    )
-    table = _table(("frames", "number", "status", "reason"), rows)
-    return f"""<section><h2>Frames of the recording</h2>
-<svg class="strip" role="img" aria-label="Status of each frame, in the order of the recording"
-viewBox="0 0 {start} 1" preserveAspectRatio="none">{"".join(runs)}</svg>
-<p class="controls soft">{legend}</p>
-<details><summary>All {start} frames, with reasons</summary>{table}</details></section>"""
-
-
-def _all_figures(found: ResultFolder) -> str:
-    def flat(prefix: str, value: Any) -> Iterable[tuple[str, str]]:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                yield from flat(f"{prefix}{key}.", inner)
-        else:
-            yield escape(prefix[:-1]), escape(json.dumps(value))
-
-    rows = list(flat("", found.result))
-    return _folded("All of result.json", _table(("figure", "value"), rows)) if rows else ""
-
-
-def _folded(summary: str, content: str) -> str:
-    return f"<section><details><summary>{summary}</summary>{content}</details></section>"
-
-
-def _table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of cells that are escaped already."""
-    head = "".join(f"<th>{name}</th>" for name in heading)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    return f'<div class="scroll">{table}</div>'

@@ -10,7 +10,8 @@ import pytest
 from jaxshape.data.chairs import random_chair
 from jaxshape.results.evaluation import EvaluateConfig, evaluate
 from jaxshape.results.journal import Journal
-from jaxshape.results.study import (
+from jaxshape.search.config import RefineConfig
+from study import (
     TestSet,
     by_method,
     column,
@@ -20,7 +21,6 @@ from jaxshape.results.study import (
     measurement,
     subjects,
 )
-from jaxshape.search.config import RefineConfig
 
 FRAMES = (1, 2)
 SEARCH = RefineConfig(iterations=2, population=4)

@@ -6,10 +6,9 @@ import sys
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from PIL import Image
 
-from jaxshape.results import plots
-from jaxshape.results.plots import compare_searches, convergence, plot_search
+from jaxshape.report import plots
+from jaxshape.report.plots import compare_searches, plot_search
 from jaxshape.results.traces import Search
 from jaxshape.search.refiner import Distribution, Trace
 
@@ -122,15 +121,6 @@ def test_the_same_search_gives_the_same_picture(tmp_path):
     assert first == second
 
 
-def test_convergence_takes_traces_of_different_lengths(tmp_path):
-    falling = np.linspace(1, 0, 20) + np.zeros((5, 1))
-    convergence(tmp_path / "plot.png", {"CMA-ES": falling, "Adam": falling[:1, :7]})
-    with Image.open(tmp_path / "plot.png") as image:
-        pixels = np.array(image.convert("RGB")).astype(int)
-    for color in ((0x00, 0x72, 0xB2), (0xE6, 0x9F, 0x00)):
-        assert (np.abs(pixels - color).max(axis=-1) < 8).sum() > 100
-
-
 def test_importing_the_module_leaves_matplotlib_alone():
-    code = "import sys, jaxshape.results.plots; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, jaxshape.report.plots; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -8,7 +8,7 @@ import pytest
 from jaxshape.model.config import TrainConfig
 from jaxshape.model.training import Report
 from jaxshape.model.weights import fingerprint, load_prior, save_prior
-from jaxshape.results.card import COLUMNS, describe, hardware, rows_of, training_card
+from jaxshape.report.card import COLUMNS, describe, hardware, rows_of, training_card
 
 DATA = {"config": {"views": 6, "noisy": 0.25}, "objects": 50, "used": 48, "source": "mugs/"}
 METRICS = [Report(3, 0.5, 0.1, 9.0, 20.4), Report(5, 0.25, 0.75, 9.0, 30.3)]

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 import trimesh
-import viser
-import viser.transforms
+import viser  # pyright: ignore[reportMissingImports] - of the extra `viewer`
+import viser.transforms  # pyright: ignore[reportMissingImports]
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
+from jaxshape.report.palette import LAYERS
 from jaxshape.results.folder import (
-    LAYERS,
-    Keyframe,
+    KeyframeRecord,
     ResultFolder,
     camera_poses,
     extent,
@@ -118,7 +118,7 @@ class LiveView:
         if image is not None:
             self.image.image = image
 
-    def _at_slider(self) -> Keyframe | None:
+    def _at_slider(self) -> KeyframeRecord | None:
         keyframes = self.found.keyframes
         return keyframes[min(int(self.slider.value), len(keyframes) - 1)] if keyframes else None
 
@@ -256,7 +256,7 @@ def _camera(
     scene: viser.SceneApi,
     name: str,
     found: ResultFolder,
-    keyframe: Keyframe,
+    keyframe: KeyframeRecord,
     T_object_camera: Float[np.ndarray, "4 4"],
 ) -> Any:
     half_width, half_height = half_field_of_view(found)

@@ -1,0 +1,61 @@
+"""What the figures of the experiments share: size, lines for searches, means with intervals.
+
+Lines differ in their dashes as well as in their colours.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Num
+
+from jaxshape.report.figures import save_figure
+from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE, SKY
+
+COLUMN, PAGE = 3.5, 7.0
+"""Widths in inches: of a column of a paper, and of a page."""
+
+LINES: dict[str, dict[str, Any]] = {
+    "encoder": {"color": INK, "dashes": (1, 1.2)},
+    "CMA-ES": {"color": BLUE, "dashes": ()},
+    "gradient descent": {"color": ORANGE, "dashes": (4, 1.5)},
+    "Adam": {"color": GREEN, "dashes": (6, 1.5, 1, 1.5)},
+    "CMA-ES, composed": {"color": SKY, "dashes": ()},
+    "F, occluded empty": {"color": GREY, "dashes": ()},
+    "F, occluded full": {"color": GREY, "dashes": (2, 2)},
+}
+"""How the same thing is drawn in every figure."""
+
+
+def interval(samples: Num[np.ndarray, "n ..."]) -> Float[np.ndarray, "2 ..."]:
+    """The 95 % interval of the mean over the rows, by bootstrap over the rows.
+
+    A single row has no spread: both ends are that row.
+    """
+    from scipy.stats import bootstrap
+
+    if len(samples) == 1:
+        return np.stack([samples[0], samples[0]])
+    found = bootstrap(
+        (samples,), np.mean, axis=0, vectorized=True, method="percentile",
+        n_resamples=2000, batch=200, rng=np.random.default_rng(0),
+    )  # fmt: skip
+    return np.stack([found.confidence_interval.low, found.confidence_interval.high])
+
+
+def draw_mean(
+    axes: Any, x: Any, samples: Float[np.ndarray, "n k"], *, label: str = "", **line: Any
+) -> None:
+    """Draw the mean over the rows as a line, with its 95 % interval as a band."""
+    low, high = interval(samples)
+    axes.fill_between(x, low, high, color=line["color"], alpha=0.18, linewidth=0)
+    axes.plot(x, samples.mean(axis=0), label=label, **line)
+
+
+def save_column(
+    stem: Path, draw: Callable[[Any], None], *, height: float, width: float = COLUMN
+) -> None:
+    """Write a figure for a column of a paper (or a page), as `stem`.png and `stem`.svg."""
+    for suffix in (".png", ".svg"):
+        save_figure(stem.with_suffix(suffix), (width, height), draw, font=8.0)

@@ -1,0 +1,109 @@
+"""The tables of a report: keyframes, frames, and all of result.json, as HTML."""
+
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from itertools import groupby
+from typing import Any, NamedTuple
+
+from jaxshape.report.palette import GREY, STATUS_COLORS
+from jaxshape.results.folder import KeyframeRecord, ResultFolder
+from jaxshape.results.summary import number
+
+
+class Column(NamedTuple):
+    """A column of the keyframe table."""
+
+    heading: str
+    figure: str
+    """Its key in keyframes.json."""
+    digits: int = 2
+    times: float = 1.0
+
+
+COLUMNS = (
+    Column("object pixels", "object_pixels", 0),
+    Column("inliers, %", "inlier_fraction", 0, times=100.0),
+    Column("overlap, %", "overlap", 0, times=100.0),
+    Column("rmse, mm", "rmse", 1, times=1000.0),
+    Column("conditioning", "conditioning", 4),
+    *(Column(f"{part}, s", f"seconds_{part}")
+      for part in ("track", "cut", "fuse", "refine", "realign")),
+)  # fmt: skip
+
+ABOUT_COLUMNS = (
+    "Overlap: of the keyframe’s points, those that the map should show from there; inliers: of "
+    "these, those that agree with it; rmse: of the inliers’ distances; conditioning: smallest over "
+    "largest eigenvalue of the alignment, 0 where a motion is free; then the seconds of each part. "
+    "Empty where the pose was not tracked, or a part was not due."
+)
+
+
+def keyframe_table(keyframes: Sequence[KeyframeRecord]) -> str:
+    """What is known of each keyframe; columns of which nothing is known are left out."""
+    cells = {
+        column.heading: [
+            number(k.figures.get(column.figure), column.digits, times=column.times)
+            for k in keyframes
+        ]
+        for column in COLUMNS
+    }
+    known = {heading: values for heading, values in cells.items() if any(values)}
+    names = [escape(keyframe.name) for keyframe in keyframes]
+    table = _table(("keyframe", *known), zip(names, *known.values(), strict=True))
+    about = f'<p class="soft">{ABOUT_COLUMNS}</p>'
+    return _folded("Figures of each keyframe", about + table)
+
+
+def frame_strip(found: ResultFolder) -> str:
+    """A strip with a colour for each frame, and the runs of frames that fared alike."""
+    if not found.frames:
+        return ""
+    fared = lambda frame: (str(frame.get("status")), str(frame.get("reason") or ""))  # noqa: E731
+    runs, rows, start = [], [], 0
+    for (status, reason), run in groupby(found.frames, fared):
+        names = [str(frame.get("name", frame.get("index"))) for frame in run]
+        color = STATUS_COLORS.get(status, GREY)
+        runs.append(
+            f'<rect x="{start}" y="0" width="{len(names)}" height="1" fill="{color}">'
+            f"<title>{escape(names[0])}: {escape(status)}</title></rect>"
+        )
+        extent = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+        rows.append((escape(extent), str(len(names)), escape(status), escape(reason)))
+        start += len(names)
+    present = {status for _, _, status, _ in rows}
+    legend = "".join(
+        f'<span><i style="background:{color}"></i> {status}</span>'
+        for status, color in STATUS_COLORS.items()
+        if status in present
+    )
+    table = _table(("frames", "number", "status", "reason"), rows)
+    return f"""<section><h2>Frames of the recording</h2>
+<svg class="strip" role="img" aria-label="Status of each frame, in the order of the recording"
+viewBox="0 0 {start} 1" preserveAspectRatio="none">{"".join(runs)}</svg>
+<p class="controls soft">{legend}</p>
+<details><summary>All {start} frames, with reasons</summary>{table}</details></section>"""
+
+
+def all_figures(found: ResultFolder) -> str:
+    def flat(prefix: str, value: Any) -> Iterable[tuple[str, str]]:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                yield from flat(f"{prefix}{key}.", inner)
+        else:
+            yield escape(prefix[:-1]), escape(json.dumps(value))
+
+    rows = list(flat("", found.result))
+    return _folded("All of result.json", _table(("figure", "value"), rows)) if rows else ""
+
+
+def _folded(summary: str, content: str) -> str:
+    return f"<section><details><summary>{summary}</summary>{content}</details></section>"
+
+
+def _table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of cells that are escaped already."""
+    head = "".join(f"<th>{name}</th>" for name in heading)
+    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="scroll">{table}</div>'
