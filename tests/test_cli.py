@@ -230,14 +230,11 @@ def test_a_search_that_cannot_be_is_refused_before_frames_are_read(
     assert said in refused("reconstruct", tmp_path / "no such frames", *options)
 
 
-def test_a_search_of_ones_own_is_found_in_the_current_folder(
-    refused, tmp_path, monkeypatch, linear_prior
-):
+def test_a_search_of_ones_own_is_found_in_the_current_folder(refused, tmp_path, monkeypatch):
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "search.py").write_text("def build(variant, *_): raise ValueError(variant)")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(weights, "load_prior", lambda path=None: linear_prior)
     name = "own.search:build@Reached."
     assert refused("reconstruct", tmp_path / "frames", "--method", name) == "Reached."
 
