@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -24,7 +25,6 @@ from jaxshape.model.config import Architecture
 from jaxshape.model.pca import PCA
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import save_prior
-from jaxshape.search import objective, reconstruction, run
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
 
@@ -113,6 +113,12 @@ def followed(known, mapper):
         return last._replace(state=state, shape=shape)
 
     return followed
+
+
+@pytest.fixture
+def unchecked_types(monkeypatch):
+    """Types are not checked while a test runs, as in a user's program."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(name="run")

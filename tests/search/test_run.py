@@ -305,7 +305,7 @@ def test_one_key_is_one_for_each_object(counted):
         (KEYS, CODES[:, :3], r"codes have shape \(3, 3\); give \[object, 4\]"),
     ],
 )
-def test_keys_and_codes_that_do_not_fit_are_named(counted, keys, codes, said):
+def test_keys_and_codes_that_do_not_fit_are_named(unchecked_types, counted, keys, codes, said):
     refiner = build_refiner("cma", D, CONFIG)
     with pytest.raises(ValueError, match=said):
         refine(keys, counted, codes, TARGETS, refiner, 2)
