@@ -2,7 +2,7 @@
 
     family, family:variant                     a module of `methods/`, or an entry point of the
                                                group `jaxshape.methods`
-    package.module:function[@variant]          any function that can be imported
+    module:function, package.module:function[@variant]   any function that can be imported
 
 Behind every name is a function `build(variant, dim, config)`. It gives a `Refiner` over points of
 `dim` numbers with the settings of a `RefineConfig`, and raises `ValueError` for a variant that it
@@ -10,6 +10,7 @@ does not know; without a variant, it is given None.
 """
 
 import importlib
+import importlib.util
 import pkgutil
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
@@ -40,14 +41,14 @@ def find_build(name: str) -> tuple[Build, str | None]:
         ValueError: There is no such search, or what the name points to cannot be imported.
     """
     family, _, variant = name.partition(":")
-    if "." in family and variant:
-        function, _, variant = variant.partition("@")
-        return _imported(name, family, function), variant or None
     if family in _own():
         return importlib.import_module(f"{__package__}.methods.{family}").build, variant or None
     if family in _offered():
         offered = _offered()[family]
         return _imported(name, offered.module, offered.attr), variant or None
+    if variant and ("." in family or (family and importlib.util.find_spec(family))):
+        function, _, variant = variant.partition("@")
+        return _imported(name, family, function), variant or None
     raise ValueError(
         f"There is no method {name!r}; choose from {', '.join(families())}, or 'encoder' for no"
         " search at all. Some have variants: cma:ipop, gradient:adam, evosax:Sep_CMA_ES. A function"

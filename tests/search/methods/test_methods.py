@@ -82,17 +82,19 @@ def package(tmp_path, monkeypatch):
     folder = tmp_path / "their_package"
     folder.mkdir()
     (folder / "searches.py").write_text(SEARCHES)
+    (tmp_path / "their_module.py").write_text(SEARCHES)
     (folder / "broken.py").write_text("import nowhere")
     (folder / "unfinished.py").write_text("def build(:")
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
-    for name in [name for name in sys.modules if name.startswith("their_package")]:
+    for name in [name for name in sys.modules if name.startswith("their_")]:
         del sys.modules[name]
 
 
+@pytest.mark.parametrize("module", ["their_package.searches", "their_module"])
 @pytest.mark.parametrize("variant, left", [("", 0.5), ("@short", 0.9)])
-def test_a_function_goes_by_its_import_path(package, variant, left):
-    refiner = build_refiner(f"their_package.searches:build{variant}", 3, CONFIG)
+def test_a_function_goes_by_its_import_path(package, module, variant, left):
+    refiner = build_refiner(f"{module}:build{variant}", 3, CONFIG)
     state, _ = refiner.init(KEY, POINTS[0], sphere(POINTS[0]))
     np.testing.assert_allclose(refiner.step(KEY, state, sphere)[0].mean, left * POINTS[0])
 
