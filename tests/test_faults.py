@@ -27,7 +27,7 @@ from jaxshape.geometry import fusion
 from jaxshape.mapping import incremental, recording
 from jaxshape.mapping.recording import trajectory
 from jaxshape.report import page, panels
-from jaxshape.results.progress import STATE
+from jaxshape.results.checkpoint import STATE
 
 TESTS = Path(__file__).parent
 
