@@ -27,7 +27,7 @@ from jaxshape.geometry import fusion
 from jaxshape.mapping.map import mapper, recording
 from jaxshape.mapping.map.recording import trajectory
 from jaxshape.report import page, panels
-from jaxshape.results.progress import STATE
+from jaxshape.results.checkpoint import STATE
 
 TESTS = Path(__file__).parent
 
