@@ -1,13 +1,10 @@
 """Every script of the paper runs on two chairs, writes its results, and has nothing left to do."""
 
-import importlib
 import json
 from dataclasses import replace
 
 import pytest
 from PIL import Image
-
-from jaxshape.search import reconstruction
 
 SCRIPTS = [
     "convergence",
@@ -22,13 +19,9 @@ SCRIPTS = [
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_smoke(name, linear_prior, tmp_path, monkeypatch):
-    script = importlib.import_module(name)
-    monkeypatch.setattr(script, "load_prior", lambda: linear_prior)
-    for network in ("encode", "decode"):
-        if hasattr(script, network):
-            monkeypatch.setattr(script, network, getattr(reconstruction, network))
-    config = replace(script.Config(), smoke=True, results=tmp_path)
+def test_smoke(name, linear_weights, tmp_path):
+    script = load(name)
+    config = replace(script.Config(), weights=linear_weights, smoke=True, results=tmp_path)
     script.main(config)
     content = json.loads((tmp_path / f"{name}.json").read_text())
     assert content["rows"] and content["seconds"] > 0
