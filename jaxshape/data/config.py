@@ -38,10 +38,13 @@ class DatasetConfig:
     """Axis of the mesh files that points up."""
     front: Axis = "z"
     """Axis of the mesh files along which the object's front looks."""
+    resolution: int = 32
+    """Voxels along each axis of the grids (paper: 32)."""
     seed: int = 0
     """Of views, noise and surface samples."""
 
     def __post_init__(self) -> None:
+        checks.one_of("resolution", self.resolution, (8, 16, 32, 64, 128))
         checks.whole("views", self.views, 1)
         checks.within("noisy", self.noisy, 0, 1)
         check_axes(self.up, self.front)

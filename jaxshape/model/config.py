@@ -1,10 +1,13 @@
 """Sizes of the auto-encoder and settings of its training; free of JAX, for the command line."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
+from jaxshape import checks
 from jaxshape.data.config import InputConfig
 
+Optimizer = Literal["muon", "adam"]
+Schedule = Literal["cosine", "constant"]
 Precision = Literal["float32", "bfloat16"]
 """Of the matrix products of a decoder."""
 
@@ -31,14 +34,16 @@ class Architecture:
     code: int = 100
 
     def __post_init__(self) -> None:
-        if not self.decoder or len(self.encoder) != len(self.decoder) + 1:
+        for name in ("encoder", "decoder"):
+            if min(getattr(self, name), default=0) < 1:
+                checks.refuse(name, getattr(self, name), "numbers of channels, 1 or more each")
+        checks.whole("code", self.code, 2)
+        if len(self.encoder) != len(self.decoder) + 1:
             raise ValueError(
-                f"encoder has {len(self.encoder)} layers and decoder {len(self.decoder)} entries; "
-                "give at least one entry for the decoder and one more for the encoder, "
-                "such as (32, 64, 128, 256) and (128, 64, 32) for 32 voxels a side."
+                f"The encoder has {len(self.encoder)} layers and the decoder "
+                f"{len(self.decoder)} numbers of channels; give the encoder one more than the "
+                "decoder, such as 32 64 128 256 and 128 64 32 for grids of 32^3 voxels."
             )
-        if min(*self.encoder, *self.decoder, self.code) < 1:
-            raise ValueError(f"{self}: every number of channels and the code are at least 1.")
 
     @property
     def resolution(self) -> int:
@@ -59,12 +64,12 @@ class TrainConfig:
     """Batches in all."""
     batch: int = 32
     """Pairs in a batch, over all devices."""
-    optimizer: Literal["muon", "adam"] = "muon"
+    optimizer: Optimizer = "muon"
     """Adam (paper), or Muon, which orthogonalises the steps of the kernels: it reaches in a third
     of the samples what Adam reaches."""
     learning_rate: float = 4e-3
     """Peak of the optimiser's step size (paper: 1e-4, of Adam)."""
-    schedule: Literal["cosine", "constant"] = "cosine"
+    schedule: Schedule = "cosine"
     """Whether the step size warms up and decays to zero along a cosine, or stays (paper)."""
     occupied_weight: float = 1.5
     """Of occupied voxels in the loss (paper: 1). At 1.5 a voxel counts as occupied from a
@@ -80,6 +85,17 @@ class TrainConfig:
     """Steps between checkpoints and lines of metrics; a killed run goes on from the last."""
     seed: int = 0
     """Of the first weights and of the batches."""
+
+    def __post_init__(self) -> None:
+        checks.one_of("optimizer", self.optimizer, get_args(Optimizer))
+        checks.one_of("schedule", self.schedule, get_args(Schedule))
+        for name in ("steps", "batch", "report_every"):
+            checks.whole(name, getattr(self, name), 1)
+        for name in ("learning_rate", "occupied_weight"):
+            checks.positive(name, getattr(self, name))
+        for name in ("code_noise", "code_weight"):
+            checks.at_least(name, getattr(self, name), 0)
+        checks.whole("seed", self.seed, 0)
 
 
 PRESETS = {
