@@ -171,3 +171,16 @@ def test_commands_run(document, place, run, unchecked_types):
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_slow_commands_run(document, place, run, unchecked_types):
     run_all(run, [line for of, line in RUN if of == document and is_slow(line)])
+
+
+@pytest.mark.slow
+def test_the_quickstart_prints_what_it_says(tmp_path, monkeypatch, capsys, unchecked_types):
+    """With the weights of the package, as it stands: refining helps."""
+    monkeypatch.chdir(tmp_path)
+    code = fenced("README.md")[0][1]
+    exec(compile(code, "README.md", "exec"), {})
+    printed = [float(x) for x in capsys.readouterr().out.split()]
+    (comment,) = re.findall("# (encoder.*)", code)
+    said = [float(x) for x in re.findall(r"\d\.\d+", comment)]
+    assert printed == pytest.approx(said, abs=0.003)
+    assert printed[0] < printed[2] < printed[1]
