@@ -15,7 +15,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.evidence import Grids, binary
 from jaxshape.model.config import Architecture
 from jaxshape.model.convolution import (
     KERNEL_SIZE,
@@ -134,7 +134,7 @@ def initialize(key: PRNGKeyArray, architecture: Architecture = Architecture()) -
         key: Random key of the first weights.
         architecture: Sizes of the network.
     """
-    grid = jnp.zeros((1, *[architecture.resolution] * 3))
+    grid = jnp.zeros((1, *[architecture.resolution] * 3), jnp.float32)
     # Under jit the forward pass, which Flax traces to find the shapes, is left out.
     return jax.jit(partial(AutoEncoder(architecture).init, train=False))(key, grid)
 
@@ -161,9 +161,10 @@ def shapes(params: PyTree) -> PyTree:
 
 
 def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
-    """The code of F; M is not looked at."""
+    """The code of F, rounded where it is soft; M is not looked at."""
     network = AutoEncoder(architecture_of(params))
-    return jnp.asarray(network.apply(params, grids.occupied.astype(jnp.float32), method="encode"))
+    F = binary(grids).occupied.astype(jnp.float32)
+    return jnp.asarray(network.apply(params, F, method="encode"))
 
 
 class PreparedDecoder(NamedTuple):

@@ -174,7 +174,7 @@ def _kernel_gradient_cpu(fine, coarse):
     if not _tiled(coarse.shape, shape):
         return sum_chunks(_gradient_of_taps, size, fine, coarse).reshape(shape)
     total = sum_chunks(gradient_of_tiles, size, fine, coarse)
-    return jax.linear_transpose(transform_kernel, jnp.zeros(shape))(total)[0]
+    return jax.linear_transpose(transform_kernel, jnp.zeros(shape, jnp.float32))(total)[0]
 
 
 def _tiled(coarse_shape, kernel_shape) -> bool:

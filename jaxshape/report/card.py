@@ -184,8 +184,8 @@ meshes are in evaluation.json."""
 def _limits(card: dict[str, Any], scores: dict[str, Any] | None) -> Iterator[str]:
     yield (
         "Knows objects like those it was trained on and no others: upright, front along +z, each "
-        "axis scaled\n  to fill the grid up to a voxel on each side. What is thinner than a voxel merges with what is "
-        "beside it."
+        "axis scaled\n  to fill the grid up to a voxel on each side. What is thinner than a voxel "
+        "merges with what is beside it."
     )
     if scores is not None:
         yield (

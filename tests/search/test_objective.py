@@ -113,6 +113,24 @@ def test_a_residual_of_ones_own_sees_the_objects_own_data(linear_prior):
         np.testing.assert_allclose(losses[i, k], expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_slopes_of_the_network_are_right_in_64_bits(prior, dtype):
+    """Accumulators without a type of their own were float64, and every gradient an error."""
+    grids = np.asarray(jax.random.bernoulli(jax.random.key(1), 0.3, (2, 32, 32, 32)), np.float32)
+    code = np.linspace(-1, 1, 10)
+
+    def slope(prior, code):
+        return jax.jit(jax.value_and_grad(objective(prior, Target(*grids))))(code)
+
+    loss, expected = slope(prior, jnp.float32(code))
+    with jax.experimental.enable_x64():
+        wide = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), dtype), prior)
+        found_loss, found = slope(wide, jnp.asarray(code))
+        assert found_loss.dtype == found.dtype == jnp.float64
+        np.testing.assert_allclose(found_loss, loss, rtol=1e-4)
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_it_scores_what_the_network_decodes(prior):
     codes = jax.random.normal(jax.random.key(1), (2, 3, 10))
