@@ -49,7 +49,7 @@ def cma(
         dim: Numbers in a point, 1 or more.
         sigma0: First standard deviation, above 0, in units of the search space.
         population: Candidates per iteration, 3 or more; None for pycma's 4 + floor(3 ln dim).
-        tolerances: When the search is over.
+        tolerances: Stop criteria that end the search.
 
     Returns:
         The search.
