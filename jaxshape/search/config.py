@@ -1,4 +1,4 @@
-"""Settings of a search. Nothing here imports JAX, so that the command line can show them at once."""
+"""Settings of a search. Nothing here imports JAX, so that the command line answers at once."""
 
 import math
 from dataclasses import dataclass
