@@ -63,11 +63,15 @@ def upsample(
 
 
 class PreparedKernel(NamedTuple):
-    """A kernel for many calls of `upsample_prepared`, with what need not be done again for each."""
+    """A kernel for many calls of `upsample_prepared`, with the work done that all calls share.
+
+    Attributes:
+        kernel: The kernel itself.
+        tiles: The transformed kernel; None where fast convolution does not pay.
+    """
 
     kernel: Float[Array, "5 5 5 fine coarse"]
     tiles: Float[Array, "36 taps phases"] | None
-    """The transformed kernel, where fast convolution pays once the transform is free."""
 
 
 def prepare_kernel(kernel: Float[Array, "5 5 5 fine coarse"], side: int) -> PreparedKernel:

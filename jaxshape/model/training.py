@@ -40,25 +40,35 @@ from jaxshape.model.weights import fingerprint, flatten
 
 
 class TrainState(NamedTuple):
-    """What the next step needs."""
+    """State of a training run between two steps.
+
+    Attributes:
+        step: Steps taken so far.
+        variables: Flax collections `params` and `batch_stats`.
+        optimizer: State of the optimiser.
+    """
 
     step: Int[Array, ""]
     variables: PyTree
-    """Flax collections `params` and `batch_stats`."""
     optimizer: PyTree
 
 
 class Report(NamedTuple):
-    """Means over the steps since the last report."""
+    """Means over the steps since the last report.
+
+    Attributes:
+        step: Steps taken so far.
+        loss: Training loss, in nats per voxel (paper, section 2.3).
+        iou: IoU of the completed training grids, at threshold 0.5, from 0 to 1.
+        samples_per_second: Pairs per second.
+        seconds: Time spent on these steps.
+    """
 
     step: int
     loss: float
-    """Of training, in nats per voxel (paper, section 2.3)."""
     iou: float
-    """Of the completed training grids, at threshold 0.5."""
     samples_per_second: float
     seconds: float
-    """Spent on these steps."""
 
 
 # ------------------------------------------------------------------ one step
