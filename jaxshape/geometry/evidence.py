@@ -1,7 +1,7 @@
 """The measurement grid F and the occlusion mask M of one object.
 
-Both come from fused frames (`fusion`, paper, Eq. 6). They are binary, as in the paper, or soft. Soft
-grids hold probabilities: in each voxel surface, free space and ignorance have the weights
+Both come from fused frames (`fusion`, paper, Eq. 6). They are binary, as in the paper, or soft.
+Soft grids hold probabilities: in each voxel surface, free space and ignorance have the weights
 F (1 - M), (1 - F) (1 - M) and M, which sum to 1.
 """
 

@@ -9,7 +9,7 @@ from typing import Literal
 from jaxshape.data.config import InputConfig
 
 Precision = Literal["float32", "bfloat16"]
-""""Precision of a decoder's matrix products."""
+"""Precision of a decoder's matrix products."""
 
 
 @dataclass(frozen=True)
