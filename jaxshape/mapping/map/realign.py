@@ -40,19 +40,30 @@ _PARALLEL = 0.8  # least cosine between the normals of a cell and of the refined
 
 
 class Odometry(NamedTuple):
-    """Each keyframe's pose relative to the one before it, as it was tracked."""
+    """Tracked pose of each keyframe relative to the one before it.
+
+    Attributes:
+        T_previous_keyframe: Pose of the keyframe in the frame of the one before it `[k]`.
+        information: Inverse covariance of that pose `[k 6 6]`, over translation and rotation in the
+            frame of the previous keyframe; 0 for none.
+    """
 
     T_previous_keyframe: jaxlie.SE3
     information: Float[Array, "k 6 6"]
-    """Over translation and rotation in the frame of the previous keyframe; 0 for none."""
 
 
 class _Observed(NamedTuple):
-    """What each keyframe sees in each cell that takes part."""
+    """Patches that each keyframe sees in each cell that takes part.
+
+    Attributes:
+        mean: Mean of the points of the keyframe in the cell, in metres.
+        variance: Variance of that mean along the normal, in square metres; infinite where the
+            keyframe sees nothing.
+        normal: Unit normal of the cell.
+    """
 
     mean: Float[Array, "c k 3"]
     variance: Float[Array, "c k"]
-    """Infinite where it sees nothing."""
     normal: Float[Array, "c 3"]
 
 
@@ -67,9 +78,18 @@ def realign(
 ) -> jaxlie.SE3:
     """The poses of the keyframes that agree best with each other, the shape and the odometry.
 
-    `clouds` holds the oriented points of each keyframe, in its camera's frame, padded to one
-    number; `is_keyframe` is False for padding. Fixed keyframes keep their poses; without one, the
-    whole map may drift. `predicted` is the surface of the refined shape.
+    Args:
+        clouds: Oriented points of each keyframe, in its camera's frame, padded to one number.
+        T_world_camera: Poses of the keyframes before `[k]`.
+        is_keyframe: False for padding `[k]`.
+        lattice: Cells in which keyframes are compared.
+        predicted: Surface of the refined shape.
+        odometry: Tracked poses between neighbouring keyframes.
+        is_fixed: True for keyframes that keep their poses `[k]`; without one, the whole map may
+            drift.
+
+    Returns:
+        Poses of the keyframes after `[k]`.
     """
     moves = is_keyframe & ~is_fixed
 

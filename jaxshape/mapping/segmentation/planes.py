@@ -31,23 +31,30 @@ MAX_TILT = 65.0
 
 
 class Plane(NamedTuple):
-    """The points `p` with `normal . p + offset = 0`."""
+    """The points `p` with `normal . p + offset = 0`.
+
+    Attributes:
+        normal: Unit vector towards the camera.
+        offset: Distance of the camera from the plane, in metres.
+        share: Share of the points that lie on the plane, from 0 to 1.
+    """
 
     normal: Float[np.ndarray, " 3"]
-    """Unit length, towards the camera."""
     offset: float
-    """Distance of the camera from the plane, metres."""
     share: float
-    """Share, from 0 to 1, of the points that lie on it."""
 
 
 class Floor(NamedTuple):
-    """The plane on which the object stands: `plane.normal` is up, `plane.offset` the height of the
-    camera above it."""
+    """The plane on which the object stands.
+
+    Attributes:
+        plane: The plane: `plane.normal` is up, `plane.offset` the height of the camera above it.
+        confidence: From 0 to 1: high where enough of the plane is seen, little lies below it, and
+            the object stands on it.
+    """
 
     plane: Plane
     confidence: float
-    """From 0 to 1: enough of it is seen, little lies below it, and the object stands on it."""
 
 
 def camera_points(
