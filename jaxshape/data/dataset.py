@@ -47,7 +47,13 @@ class DatasetError(ValueError):
 
 
 class BuildProgress(NamedTuple):
-    """How much of a build is done."""
+    """Progress of a build.
+
+    Attributes:
+        objects: Objects that are done, skipped ones included.
+        total: Objects in all.
+        skipped: Objects that could not be used.
+    """
 
     objects: int
     total: int
@@ -115,9 +121,19 @@ def build_dataset(
     *,
     workers: int | None = None,
 ) -> Iterator[BuildProgress]:
-    """Write the shards that are missing, in parallel processes, yielding progress after each.
+    """Write the missing shards of a dataset in parallel processes.
 
-    Raises `DatasetError` when the folder holds a dataset of other objects or settings.
+    Args:
+        folder: Folder of the dataset; made if missing.
+        objects: Seeds of procedural chairs, or meshes.
+        config: Settings of the dataset.
+        workers: Processes, 1 or more; None for one for each CPU core.
+
+    Yields:
+        The progress, at first and after each shard.
+
+    Raises:
+        DatasetError: The folder holds a dataset of other objects or settings.
     """
     folder = Path(folder)
     _claim(folder, objects, config)
@@ -192,16 +208,22 @@ def _read_names(folder: Path, number: int) -> tuple[list[str], list[Skipped]]:
 
 
 class Dataset(NamedTuple):
-    """Objects of a dataset folder, left on disk until they are asked for."""
+    """Objects of a dataset folder, left on disk until they are asked for.
+
+    Attributes:
+        names: Names of the objects.
+        shards: Memory-mapped shards `[object view bytes]`; entry 0 of the second axis is the
+            complete surface.
+        row: Shard, and place in it, of each object.
+    """
 
     names: list[str]
     shards: list[UInt8[np.ndarray, "object view bytes"]]
-    """Memory-mapped; entry 0 of the second axis is the complete surface."""
     row: list[tuple[int, int]]
-    """Shard, and place in it, of each object."""
 
     @property
     def views(self) -> int:
+        """Views of each object."""
         return self.shards[0].shape[1] - 1
 
     def packed(self, index: int) -> UInt8[np.ndarray, "view bytes"]:
@@ -211,7 +233,14 @@ class Dataset(NamedTuple):
 
 
 def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
-    """Open a finished dataset; raises `DatasetError` where there is none, or a part is missing."""
+    """Open a finished dataset.
+
+    Args:
+        folder: Folder of the dataset.
+
+    Raises:
+        DatasetError: There is no dataset, or a part of it is missing.
+    """
     folder = Path(folder)
     if not (folder / "dataset.json").exists():
         raise DatasetError(f"There is no dataset in {str(folder)!r}; make one: jaxshape dataset.")

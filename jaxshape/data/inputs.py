@@ -16,7 +16,10 @@ def draw_pair(
 ) -> tuple[Grid, Grid]:
     """The measurement and the complete surface of one training pair.
 
-    `packed` holds an object's surface, then its views, as `Dataset.packed` gives them.
+    Args:
+        packed: An object's surface, then its views, as `Dataset.packed` gives them.
+        config: How the input is drawn.
+        rng: Random generator of the draws.
     """
     surface, views = unpack(packed[0]), packed[1:]
     if rng.random() < config.complete:
@@ -35,7 +38,7 @@ def draw_pair(
 
 
 def faulty(view: Grid, config: InputConfig, rng: np.random.Generator) -> Grid:
-    """One view with what goes wrong in real ones, each fault in its share of the views."""
+    """One view with the faults of real ones, each in its share of the views."""
     if rng.random() < config.segmentation:
         view = _cut(view, rng) if rng.random() < 0.5 else _leaked(view, rng)
     if rng.random() < config.missing:

@@ -1,4 +1,4 @@
-"""Does a seat stand on its feet? A warning for meshes read with the wrong up axis.
+"""Whether a seat stands on its feet: a warning for meshes read with the wrong up axis.
 
 Each of the six directions along the axes is scored as the seat's up direction: a seat stands on
 a few points far apart, has one large level surface near half height, and is not the same when

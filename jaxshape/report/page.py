@@ -29,6 +29,9 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
 
     Sections of what is missing are left out, and files that cannot be read are named among the
     warnings. All text that comes from the folder is escaped. `ValueError` for no folder.
+
+    Args:
+        folder: Folder of a result, from `jaxshape demo` or `jaxshape reconstruct`, finished or not.
     """
     found = read_folder(folder)
     script = _beside("page.js")

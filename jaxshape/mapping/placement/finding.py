@@ -99,6 +99,7 @@ def find_start(
     Raises:
         SequenceError: No frame shows the object well enough, can be read, or has a pose where poses
             are used.
+        ValueError: No pixel of the image can meet the prompt.
     """
     use_pose = use_pose and sequence.has_poses
     if box is not None:
