@@ -72,6 +72,8 @@ class Config:
     """Of every search, none of which stops before."""
     early: int = 60
     """Iterations that the other experiments make do with."""
+    weights: Path | None = None
+    """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False
     """Two procedural chairs and few iterations: does it run?"""
@@ -87,7 +89,7 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Follow every search on every chair, and write what was found."""
-    prior = load_prior()
+    prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
         "searches": {name: [method, repr(how)] for name, (method, how) in SEARCHES.items()},

@@ -80,6 +80,8 @@ class Config:
     """Decoder calls after which shapes are scored; the last is what every search may spend."""
     searches: tuple[str, ...] = tuple(DRAWN)
     """Those to compare, CMA-ES among them."""
+    weights: Path | None = None
+    """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False
     """Two procedural chairs and few calls: does it run?"""
@@ -96,7 +98,7 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Give every search its budget on every chair, and write what was found."""
-    prior = load_prior()
+    prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
         "budgets": config.budgets,

@@ -59,6 +59,8 @@ class Config:
     """Number of frames at which the gain decides which chairs are shown."""
     iterations: int = 60
     """Of CMA-ES (paper: 350)."""
+    weights: Path | None = None
+    """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False
     """Two procedural chairs and few iterations: does it run?"""
@@ -93,7 +95,7 @@ def run(config: Config) -> tuple[Journal, list[Shown]]:
 
     No chairs are returned where the results of these settings are there, with their pictures.
     """
-    prior = load_prior()
+    prior = load_prior(config.weights)
     settings = {
         "chairs": config.test.chairs,
         "seats": config.test.seats,

@@ -81,6 +81,8 @@ class Config:
     """Chairs to choose from where iou_by_frames.py has not been run."""
     short: int = 60
     """Iterations of the searches on the candidates."""
+    weights: Path | None = None
+    """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False
     """Two procedural chairs and few iterations: does it run?"""
@@ -97,7 +99,7 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Choose the chairs, search them long, and write what was found."""
-    prior = load_prior()
+    prior = load_prior(config.weights)
     candidates = short_searches(prior, config)
     chosen = choose(candidates, config)
     settings = {
@@ -381,7 +383,7 @@ def _how_often(shares: dict[str, Any]) -> Claim:
 
 def plot(journal: Journal, config: Config) -> None:
     """One figure for the chairs on which CMA-ES leads, one for those on which it trails."""
-    prior = load_prior()
+    prior = load_prior(config.weights)
     for kind, suffix in ((LEADS, ""), (TRAILS, "_opposite")):
         rows = [row for row in journal.rows.values() if row["kind"] == kind]
         pictures = [list(panels(row, prior, config)) for row in rows]

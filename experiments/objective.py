@@ -105,6 +105,8 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 48
     """Of Adam."""
+    weights: Path | None = None
+    """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False
     """Two procedural chairs and few iterations: does it run?"""
@@ -122,7 +124,7 @@ def main(config: Config) -> None:
 
 def run(config: Config, residuals: dict[str, Residual] = RESIDUALS) -> tuple[Journal, Journal]:
     """Minimise every residual for every chair, without and with noise; write what was found."""
-    prior = load_prior()
+    prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
         "iterations": config.iterations,

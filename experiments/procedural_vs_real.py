@@ -462,7 +462,7 @@ def plot(
         _plot_nearest(curves, ious)
         _plot_statistics(lower, results, sources)
 
-    save_figure(path, (10, 12), draw, font=9.0)
+    save_figure(path, (10.0, 12.0), draw, font=9.0)
 
 
 def _plot_projections(figure: Any, sources: dict[str, Seats]) -> None:

@@ -88,6 +88,8 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 60
     """Of every search."""
+    weights: Path | None = None
+    """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False
     """Two procedural chairs and few iterations: does it run?"""
@@ -104,7 +106,7 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Try every value on every chair, and write what was found."""
-    prior = load_prior()
+    prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
         "iterations": config.iterations,

@@ -26,7 +26,7 @@ from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map import mapper
 from jaxshape.mapping.placement import finding
 from jaxshape.mapping.segmentation.segment import Prompt
-from jaxshape.model import training, weights
+from jaxshape.model import training
 from jaxshape.model.config import PRESETS
 from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prior
 from jaxshape.report.plots import plot_search
@@ -35,6 +35,12 @@ from jaxshape.results.traces import read_search
 from jaxshape.search.names import families
 
 COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
+
+
+@pytest.fixture
+def linear(linear_weights):
+    """The option that chooses weights which compile at once."""
+    return "--weights", linear_weights
 
 
 # --- help -------------------------------------------------------------------------------------
@@ -135,28 +141,28 @@ def move_the_box(folder):
         (lambda folder: (folder / "camera-intrinsics.txt").unlink(), "is missing"),
     ],
 )
-def test_a_damaged_scan_is_refused(frames, refused, damage, said, linear_weights):
+def test_a_damaged_scan_is_refused(frames, refused, damage, said, linear):
     damage(frames)
-    assert said in refused("reconstruct", frames, "--box", frames / "box.json")
+    assert said in refused("reconstruct", *linear, frames, "--box", frames / "box.json")
 
 
-def test_a_missing_folder_or_box_is_refused(frames, refused, tmp_path, linear_weights):
-    assert "is not a folder" in refused("reconstruct", tmp_path / "nowhere")
-    assert "cannot be read" in refused("reconstruct", frames, "--box", tmp_path / "nowhere.json")
+def test_a_missing_folder_or_box_is_refused(frames, refused, tmp_path, linear):
+    assert "is not a folder" in refused("reconstruct", *linear, tmp_path / "nowhere")
+    assert "cannot be read" in refused(
+        "reconstruct", *linear, frames, "--box", tmp_path / "nowhere.json"
+    )
 
 
-def test_a_recording_in_which_nothing_stands_out_is_refused(frames, refused, linear_weights):
+def test_a_recording_in_which_nothing_stands_out_is_refused(frames, refused, linear):
     for path in frames.glob("*.depth.png"):
         wall = np.full_like(np.array(Image.open(path)), 1500)
         Image.fromarray(wall).save(path)
-    said = refused("reconstruct", frames)
+    said = refused("reconstruct", *linear, frames)
     assert "say where it is with --click, --region, --depth-range or --box" in said
     assert "Nothing but floor, walls and table tops is seen" in said
 
 
-def test_poses_that_are_missing_or_inverted_are_refused(
-    frames, refused, linear_weights, monkeypatch
-):
+def test_poses_that_are_missing_or_inverted_are_refused(frames, refused, linear, monkeypatch):
     some = ("reconstruct", frames, "--box", frames / "box.json")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sequences, "poses_look_inverted", lambda _: True)
@@ -223,10 +229,10 @@ def test_options_of_a_scan_out_of_range_are_refused(scene, refused, tmp_path, op
     ],
 )
 def test_a_search_that_cannot_be_is_refused_before_frames_are_read(
-    refused, tmp_path, options, said, monkeypatch, linear_prior
+    refused, tmp_path, options, said, linear
 ):
     if "--weights" not in options:
-        monkeypatch.setattr(weights, "load_prior", lambda path=None: linear_prior)
+        options = (*options, *linear)
     assert said in refused("reconstruct", tmp_path / "no such frames", *options)
 
 
@@ -257,18 +263,18 @@ def test_options_of_an_evaluation_out_of_range_are_refused(
     assert said in refused("evaluate", *some, *options)
 
 
-def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior, linear_weights):
+def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior, linear):
     save_prior(tmp_path / "tiny.safetensors", prior, {})
     tiny = ("--weights", tmp_path / "tiny.safetensors")
     (tmp_path / "empty.ply").write_bytes(b"")
-    said = refused("evaluate", "--meshes", tmp_path / "empty.ply", *tiny)
+    said = refused("evaluate", *linear, "--meshes", tmp_path / "empty.ply", *tiny)
     assert "None of the 1 meshes can be used" in said and "empty" in said
-    refused("evaluate", "--meshes", tmp_path / "nowhere.ply", *tiny)
+    refused("evaluate", *linear, "--meshes", tmp_path / "nowhere.ply", *tiny)
 
     lying = trimesh.load_mesh(chair)
     lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     lying.export(tmp_path / "lying.ply")
-    said = refused("evaluate", "--meshes", tmp_path / "lying.ply")
+    said = refused("evaluate", *linear, "--meshes", tmp_path / "lying.ply")
     assert "lie on their side" in said and "--up z" in said
 
 
@@ -334,20 +340,14 @@ RESULTS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def linear_weights(linear_prior, monkeypatch):
-    """A prior that compiles at once, in place of the packaged weights."""
-    monkeypatch.setattr(weights, "load_prior", lambda path=None: linear_prior)
-
-
-def test_reconstruct_writes_its_files(run, frames, tmp_path, linear_weights):
+def test_reconstruct_writes_its_files(run, frames, tmp_path, linear):
     """A damaged frame costs that frame alone, and is said."""
     damaged = frames / "frame-000001.depth.png"
     damaged.write_bytes(damaged.read_bytes()[:60])
     output = tmp_path / "out"
     few = ("--iterations", 2, "--keyframe-iterations", 1, "--min-hits", 1)
     arguments = (frames, "--box", frames / "box.json", *few, "--output", output)
-    status, out, err = run("reconstruct", *arguments)
+    status, out, err = run("reconstruct", *linear, *arguments)
     assert status == 0, err
     of_recordings = {"keyframes", "keyframes.json", "trajectory.txt", "trajectory.log"}
     assert {path.name for path in output.iterdir()} == RESULTS | of_recordings
@@ -362,16 +362,16 @@ def test_reconstruct_writes_its_files(run, frames, tmp_path, linear_weights):
     assert "frame-000001: unreadable" in err and "cannot be read as an image" in err
     assert "objective:" in out and str(output) in out
 
-    status, out, err = run("plot", output)
+    status, out, err = run("plot", *linear, output)
     assert status == 0 and str(output / "trace.png") in out, err
     plot_search(tmp_path / "again.png", read_search(output))
     assert (tmp_path / "again.png").read_bytes() == (output / "trace.png").read_bytes()
-    status, out, err = run("plot", output, output, "--output", tmp_path / "compare.svg")
+    status, out, err = run("plot", *linear, output, output, "--output", tmp_path / "compare.svg")
     assert status == 0 and (tmp_path / "compare.svg").exists(), err
 
 
 def test_options_reach_the_map_and_the_search_of_the_object(
-    run, scene, tmp_path, linear_weights, monkeypatch
+    run, scene, tmp_path, linear, monkeypatch
 ):
     asked = {}
 
@@ -388,7 +388,7 @@ def test_options_reach_the_map_and_the_search_of_the_object(
     tracking = ("--against", "keyframe", "--on", "object", "--min-inliers", 0.5, "--max-angle", 9)
     mapping = ("--no-realign", "--isotropic", "--min-hits", 2, "--keyframe-angle", 7)
     options = ("--poses", "none", "--first", 1, "--seed", 5, "--output", tmp_path)
-    status, _, err = run("reconstruct", scene, *prompt, *tracking, *mapping, *options)
+    status, _, err = run("reconstruct", *linear, scene, *prompt, *tracking, *mapping, *options)
     assert status == 2 and "enough" in err, err
     assert asked["prompt"] == Prompt((10.0, 20.0), (0.0, 0.0, 40.0, 40.5), (0.5, 3.0))
     assert asked["tracking"] == TrackingConfig("keyframe", "object", 0.5, max_angle=9.0)
@@ -402,11 +402,11 @@ def test_plots_of_other_folders_are_refused(run, tmp_path):
         assert status == 2 and said in err and not out
 
 
-def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear_weights):
+def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear):
     results = []
     for name in ("first", "second"):
         arguments = ("--frames", 2, "--method", "gradient", "--iterations", 2)
-        status, out, err = run("demo", *arguments, "--output", tmp_path / name)
+        status, out, err = run("demo", *linear, *arguments, "--output", tmp_path / name)
         assert status == 0 and "IoU with the true surface" in out, err
         assert {path.name for path in (tmp_path / name).iterdir()} == RESULTS
         results.append(json.loads((tmp_path / name / "result.json").read_text()))
@@ -416,10 +416,10 @@ def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear_w
     assert results[0] == results[1]
 
 
-def test_evaluate_writes_scores_of_each_mesh_and_their_means(run, chair, tmp_path, linear_weights):
+def test_evaluate_writes_scores_of_each_mesh_and_their_means(run, chair, tmp_path, linear):
     path = tmp_path / "scores.json"
     arguments = ("--frames", "1,2", "--methods", "encoder,gradient", "--iterations", 2)
-    status, out, err = run("evaluate", "--meshes", chair, *arguments, "--output", path)
+    status, out, err = run("evaluate", *linear, "--meshes", chair, *arguments, "--output", path)
     assert status == 0, err
     content = json.loads(path.read_text())
     assert set(content) == {"config", "skipped", "per_mesh", "means"}
@@ -433,8 +433,8 @@ def test_evaluate_writes_scores_of_each_mesh_and_their_means(run, chair, tmp_pat
 def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
     run, chair, tmp_path, monkeypatch, linear_prior
 ):
-    asked, current = [], [linear_prior]
-    monkeypatch.setattr(weights, "load_prior", lambda path=None: current[0])
+    asked, weights = [], tmp_path / "weights.safetensors"
+    save_prior(weights, linear_prior, {})
 
     def evaluate(prior, models, config):
         asked.append(len(models))
@@ -449,10 +449,11 @@ def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
     for name in ("a.ply", "b.ply", "c.ply"):
         (tmp_path / "meshes" / name).write_bytes(chair.read_bytes())
     arguments = ("--meshes", tmp_path / "meshes", "--frames", 1, "--methods", "encoder")
+    arguments += ("--weights", weights)
     for status in (2, 2, 0):
         assert run("evaluate", *arguments, "--output", tmp_path / "scores.json")[0] == status
         if len(asked) == 1:
-            current[0] = linear_prior._replace(code_mean=linear_prior.code_mean + 1)
+            save_prior(weights, linear_prior._replace(code_mean=linear_prior.code_mean + 1), {})
     assert asked == [3, 3, 2]
 
 

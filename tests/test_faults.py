@@ -24,10 +24,10 @@ from orbit_recording import (
 from jaxshape.cli import recording as command
 from jaxshape.data.sequences import read_trajectory
 from jaxshape.geometry import fusion
-from jaxshape.mapping.map import mapper, recording
+from jaxshape.mapping.map import recording
 from jaxshape.mapping.map.recording import trajectory
 from jaxshape.report import page, panels
-from jaxshape.results.progress import STATE
+from jaxshape.results.checkpoint import STATE
 
 TESTS = Path(__file__).parent
 
@@ -173,17 +173,18 @@ OPTIONS = ("--iterations", "3", "--keyframe-iterations", "2", "--min-hits", "1")
 
 
 @pytest.fixture
-def run(run, monkeypatch, known):
+def run(run, monkeypatch, known_weights):
     """Run `reconstruct` in this process; returns its exit status, its answer and its complaint."""
     monkeypatch.setattr(panels, "write_overview", lambda *_: None)
     monkeypatch.setattr(page, "write_report", lambda *_: None)
-    return lambda folder, *options: run("reconstruct", folder, *OPTIONS, *options)
+    given = ("--weights", known_weights, *OPTIONS)
+    return lambda folder, *options: run("reconstruct", folder, *given, *options)
 
 
 @pytest.fixture
-def compiled(monkeypatch, session_mapper):
+def compiled(monkeypatch, mapper):
     """The mapper of all tests in place of one to be compiled; its settings are its own."""
-    monkeypatch.setattr(mapper, "build_mapper", lambda *_, **__: session_mapper)
+    monkeypatch.setattr(module, "build_mapper", lambda *_, **__: mapper)
 
 
 def test_no_frame_can_be_read(run, folder, tmp_path, compiled):
@@ -254,31 +255,22 @@ def test_fresh_begins_anew(run, folder, tmp_path, compiled, monkeypatch):
 
 
 PROGRAM = """
-import sys
-import numpy as np
-sys.path.insert(0, sys.argv.pop(1))
-from known_shape import install
-from jaxshape.model.shapes import ShapePrior
-with np.load(sys.argv.pop(1)) as file:
-    params = dict(file)
 from jaxshape.report import page, panels
 panels.write_overview = page.write_report = lambda *_: None
-code = len(params["waves"])
-install(setattr, ShapePrior(params, np.zeros(code, np.float32), np.eye(code, dtype=np.float32)))
 from jaxshape import cli
 cli.main()
 """
 
 
 @pytest.mark.parametrize("poses", ["given", pytest.param("first", marks=pytest.mark.slow)])
-def test_a_process_is_killed(run, folder, tmp_path, known, poses):
+def test_a_process_is_killed(run, folder, tmp_path, known_weights, poses):
     """What the same command, given again, ends with is what it ends with undisturbed."""
-    np.savez(tmp_path / "known.npz", **known.params)
     given = (folder, "--box", folder / "box.json", "--poses", poses)
     assert run(*given, "--output", tmp_path / "undisturbed")[0] == 0
 
     there = tmp_path / "killed"
-    arguments = (TESTS, tmp_path / "known.npz", "reconstruct", *given, *OPTIONS, "--output", there)
+    given = ("--weights", known_weights, *given)
+    arguments = ("reconstruct", *given, *OPTIONS, "--output", there)
     argv = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
     cache = {
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "compiled"),

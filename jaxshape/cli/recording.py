@@ -66,13 +66,8 @@ class Reconstruct(Rebuild):
         from jaxshape.mapping.placement.finding import find_start
         from jaxshape.mapping.segmentation.segment import Prompt, check_prompt
         from jaxshape.model.weights import fingerprint
-        from jaxshape.results.progress import (
-            load_state,
-            observation_of,
-            remove_state,
-            save_state,
-            write_progress,
-        )
+        from jaxshape.results.checkpoint import load_state, remove_state, save_state
+        from jaxshape.results.progress import observation_of, write_progress
         from jaxshape.search.reconstruction import require_measured
 
         require(self.every >= 1, f"--every is {self.every}; give 1 or more.")

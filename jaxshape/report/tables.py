@@ -12,11 +12,17 @@ from jaxshape.results.summary import number
 
 
 class Column(NamedTuple):
-    """A column of the keyframe table."""
+    """A column of the keyframe table.
+
+    Attributes:
+        heading: Text at its top, with the unit.
+        figure: Its key in keyframes.json.
+        digits: Decimals to show.
+        times: What a figure is multiplied by, from the unit of the file to that of the heading.
+    """
 
     heading: str
     figure: str
-    """Its key in keyframes.json."""
     digits: int = 2
     times: float = 1.0
 
@@ -32,10 +38,11 @@ COLUMNS = (
 )  # fmt: skip
 
 ABOUT_COLUMNS = (
-    "Overlap: of the keyframe’s points, those that the map should show from there; inliers: of "
-    "these, those that agree with it; rmse: of the inliers’ distances; conditioning: smallest over "
-    "largest eigenvalue of the alignment, 0 where a motion is free; then the seconds of each part. "
-    "Empty where the pose was not tracked, or a part was not due."
+    "Overlap is the share of the keyframe’s points that the map should show from there; inliers "
+    "are the share of these that agree with it, and rmse is the root mean square of their "
+    "distances. Conditioning is the smallest over the largest eigenvalue of the alignment, 0 where "
+    "a motion is free. The last columns are the seconds that each part took. A cell is empty where "
+    "the pose was not tracked, or the part was not due."
 )
 
 

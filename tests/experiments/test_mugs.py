@@ -49,10 +49,9 @@ def test_mugs_differ_and_repeat():
     assert not np.allclose(first.extents, other.extents, rtol=0.01)
 
 
-def test_smoke(tmp_path, monkeypatch, linear_prior):
-    monkeypatch.setattr(mugs, "load_prior", lambda path: linear_prior)
+def test_smoke(tmp_path, linear_weights):
     config = mugs.Config(
-        output=tmp_path / "mugs", weights=tmp_path, picture=tmp_path / "mugs.png", smoke=True
+        output=tmp_path / "mugs", weights=linear_weights, picture=tmp_path / "mugs.png", smoke=True
     )
     names = mugs.main(config)
     assert sorted(path.stem for path in config.output.iterdir()) == sorted(names)

@@ -5,12 +5,33 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.model.autoencoder import AutoEncoder, architecture_of, initialize
+from jaxshape.geometry.evidence import Grids
+from jaxshape.model import shapes
+from jaxshape.model.autoencoder import (
+    AUTOENCODER,
+    AutoEncoder,
+    architecture_of,
+    initialize,
+)
 from jaxshape.model.config import Architecture
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import flatten
 
 TINY = Architecture((4, 4, 8, 8), (8, 8, 4), 10)
 BATCHES = [(), (1,), (2, 3)]
+
+
+def prior_of(params):
+    d = params["params"]["decoder"]["conv0"].shape[-1]
+    return ShapePrior(AUTOENCODER, params, jnp.zeros(d), jnp.eye(d))
+
+
+def encode(params, grid):
+    return shapes.encode(prior_of(params), Grids(grid, grid))
+
+
+def decode(params, code):
+    return shapes.decode(prior_of(params), code)
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +169,31 @@ def test_weights_start_as_the_paper_says(params):
     assert abs(scales.mean() - 1) < 4 * 0.02 / np.sqrt(scales.size)
     assert 0.01 < scales.std() < 0.03
     assert not any(x.any() for n, x in named.items() if n.endswith("bias"))
+
+
+@pytest.mark.parametrize("layers, resolution", [(3, 16), (4, 32), (5, 64)])
+def test_the_number_of_layers_decides_the_resolution(layers, resolution):
+    architecture = Architecture((4,) * layers, (4,) * (layers - 1), 6)
+    assert architecture.resolution == resolution
+    params = jax.eval_shape(partial(initialize, architecture=architecture), jax.random.key(0))
+    assert architecture_of(params) == architecture
+    grid = jax.ShapeDtypeStruct((2, *[resolution] * 3), bool)
+    code = jax.eval_shape(encode, params, grid)
+    assert code.shape == (2, 6)
+    assert jax.eval_shape(decode, params, code).shape == grid.shape
+    for other in (resolution // 2, 2 * resolution):
+        with pytest.raises(ValueError, match=f"knows shapes of {resolution} x {resolution}"):
+            jax.eval_shape(encode, params, jax.ShapeDtypeStruct((2, *[other] * 3), bool))
+
+
+@pytest.mark.parametrize(
+    "sizes, said",
+    [
+        (((8, 8), (8, 8)), "encoder has 2 layers and decoder 2 entries"),
+        (((8,), ()), "at least one entry for the decoder"),
+        (((8, 8, 0), (8, 8)), "at least 1"),
+    ],
+)
+def test_layers_that_do_not_match_are_refused(sizes, said):
+    with pytest.raises(ValueError, match=said):
+        Architecture(*sizes)

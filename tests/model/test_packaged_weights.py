@@ -11,9 +11,11 @@ from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.dataset import TEST_SEEDS
 from jaxshape.geometry import camera, fusion
+from jaxshape.geometry.evidence import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import architecture_of
 from jaxshape.model.config import Architecture
+from jaxshape.model.shapes import decode, encode
 from jaxshape.model.weights import load_card, load_prior
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
@@ -46,7 +48,7 @@ def test_they_have_the_default_architecture_and_a_card(prior):
 
 
 def test_codes_of_chairs_lie_where_the_stored_statistics_say(prior, observed):
-    codes = encode(prior.params, observed[0]) - prior.code_mean
+    codes = encode(prior, Grids(*observed[:2])) - prior.code_mean
     whitened = np.linalg.solve(np.linalg.cholesky(prior.code_covariance), np.asarray(codes).T)
     assert 0.3 < np.sqrt(np.mean(whitened**2)) < 3
 
@@ -71,6 +73,6 @@ def test_the_search_brings_shapes_nearer_to_the_truth(observed, rebuilt):
 
 def test_they_decode_to_stored_values(prior):
     """A change of format, layout or arithmetic would show here."""
-    logits = decode(prior.params, prior.code_mean)
+    logits = decode(prior, prior.code_mean)
     expected = [-5.9285, -5.9050, -5.7864, -4.7429, -5.2473, -4.4433, -4.8925, -4.4301]
     np.testing.assert_allclose(logits[::8, 3::8, 5::8].ravel()[:8], expected, rtol=1e-3, atol=1e-3)

@@ -12,8 +12,10 @@ from tiny_training import CONFIG, OBJECTS
 
 from jaxshape.data.config import InputConfig
 from jaxshape.data.dataset import unpack
+from jaxshape.geometry.evidence import Grids
 from jaxshape.model import training
 from jaxshape.model.config import PRESETS, Architecture
+from jaxshape.model.shapes import encode
 from jaxshape.model.training import TrainState, batch_of, initial_state, read_metrics, train_step
 from jaxshape.model.weights import load_prior
 
@@ -243,7 +245,7 @@ def test_the_prior_describes_the_codes_of_the_training_set(dataset, whole_run, m
     tiny_training.make_quick(monkeypatch.setattr, whole_run.programs)
     prior = whole_run.prior
     inputs, _ = batch_of(dataset, replace(CONFIG, batch=64, seed=CONFIG.seed + 1), 0)
-    codes = np.asarray(jax.jit(training.encode)(prior.params, inputs))
+    codes = np.asarray(jax.jit(encode)(prior, Grids(inputs, ~inputs)))
     np.testing.assert_allclose(prior.code_mean, codes.mean(axis=0), atol=1e-5)
     covariance = np.asarray(prior.code_covariance)
     np.testing.assert_allclose(covariance, covariance.T)
@@ -261,3 +263,8 @@ def test_the_paper_preset_is_the_paper(dataset):
     assert paper.architecture == Architecture((32, 64, 128, 256), (256, 128, 64), 100)
     for measured, surface in zip(*batch_of(dataset, replace(paper, batch=8), 0), strict=True):
         assert any(np.array_equal(measured, view) for view in views_of(dataset, surface)[1])
+
+
+def test_weights_of_another_model_are_no_start(linear_prior):
+    with pytest.raises(ValueError, match="of the kind 'pca'; give those of an autoencoder"):
+        initial_state(CONFIG, linear_prior)

@@ -5,11 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from jaxshape.model import weights
-from jaxshape.model.autoencoder import initialize
+from jaxshape.model.autoencoder import AUTOENCODER, initialize
 from jaxshape.model.config import Architecture
+from jaxshape.model.shapes import ShapeModel, ShapePrior
 from jaxshape.model.weights import (
     FORMAT,
     WeightsError,
@@ -30,7 +32,9 @@ def random_prior(seed=0):
     template = jax.eval_shape(lambda: initialize(jax.random.key(0), TINY))
     params = jax.tree.map(lambda x: jnp.float32(rng.normal(0, 0.02, x.shape)), template)
     root = rng.normal(size=(10, 10))
-    return ShapePrior(params, jnp.float32(rng.normal(size=10)), jnp.float32(root @ root.T))
+    return ShapePrior(
+        AUTOENCODER, params, jnp.float32(rng.normal(size=10)), jnp.float32(root @ root.T)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +120,8 @@ def test_a_foreign_file_is_named_with_its_format(load, rewritten, tmp_path):
         ("params/encoder/conv0", (3, 3, 3, 1, 4), r"encoder/conv0 is \(3, 3, 3, 1, 4\), expected"),
         ("params/decoder/conv0", (), "another architecture"),
         ("params/stranger", (2,), r"params/stranger is \(2,\), expected no such array"),
-        ("code_mean", (9,), r"statistics of \(9,\) codes for codes of 10 numbers"),
-        ("code_covariance", (10,), "statistics of"),
+        ("code_mean", (9,), r"covariance of shape \(10, 10\) for a mean code of shape \(9,\)"),
+        ("code_covariance", (10,), r"covariance of shape \(10,\)"),
     ],
 )
 def test_an_array_of_another_shape_is_named(name, shape, sentence, rewritten):
@@ -162,3 +166,60 @@ def test_weights_are_known_by_their_numbers(prior):
     assert fingerprint(copy) == fingerprint(prior)
     changed = prior._replace(code_mean=prior.code_mean.at[3].set(1e-6))
     assert fingerprint(changed) != fingerprint(prior)
+
+
+# --- kinds of models ----------------------------------------------------------------------------
+
+OWN = ShapeModel(
+    "own",
+    encode=lambda params, grids: jnp.zeros((len(grids.occupied), 3)),
+    decode=lambda prepared, codes: jnp.einsum("nd,dxyz->nxyz", codes, prepared.shared["basis"]),
+)
+BASIS = {"basis": jnp.ones((3, 8, 8, 8))}
+
+
+def test_weights_name_their_kind_and_an_unknown_one_is_a_sentence(tmp_path):
+    path = tmp_path / "own.safetensors"
+    save_prior(path, ShapePrior(OWN, BASIS, jnp.zeros(3), jnp.eye(3)), {})
+    with pytest.raises(WeightsError, match=r"own\.safetensors.* kind 'own'; known are autoencoder"):
+        load_prior(path)
+    found = load_prior(path, OWN)
+    assert found.model is OWN and found.resolution == 8 and found.code_size == 3
+
+
+def test_codes_that_are_none_of_an_own_model_are_named(tmp_path):
+    path = tmp_path / "own.safetensors"
+    save_prior(path, ShapePrior(OWN, BASIS, jnp.zeros(4), jnp.eye(4)), {})
+    with pytest.raises(WeightsError, match="4 numbers are no code of this model"):
+        load_prior(path, OWN)
+
+
+def test_weights_from_before_models_had_kinds_are_auto_encoders(prior, saved, tmp_path):
+    with safe_open(saved, "np") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    save_file(tensors, tmp_path / "old.safetensors", {"format": FORMAT, "card": "{}"})
+    assert load_prior(tmp_path / "old.safetensors").model == AUTOENCODER
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", [KERNEL, "code_mean"])
+def test_numbers_that_are_not_finite_are_refused(name, value, rewritten):
+    path = rewritten(lambda tensors: np.put(tensors[name], 0, value))
+    with pytest.raises(WeightsError, match=f"{name} holds NaN or infinity"):
+        load_prior(path)
+
+
+@pytest.mark.parametrize("factor", [0, -1])
+def test_a_covariance_that_is_none_is_refused(factor, rewritten):
+    path = rewritten(
+        lambda tensors: tensors.update(code_covariance=np.float32(factor * np.eye(10)))
+    )
+    with pytest.raises(WeightsError, match="not symmetric and positive definite"):
+        load_prior(path)
+
+
+def test_large_parameters_are_not_lost_in_half_precision(tmp_path):
+    path = tmp_path / "own.safetensors"
+    large = {"basis": jnp.full((3, 8, 8, 8), 1e6)}
+    save_prior(path, ShapePrior(OWN, large, jnp.zeros(3), jnp.eye(3)), {})
+    np.testing.assert_array_equal(load_prior(path, OWN).params["basis"], 1e6)

@@ -9,20 +9,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
+from jaxshape.geometry.evidence import Grids
 from jaxshape.geometry.overlap import iou
-from jaxshape.search import reconstruction
+from jaxshape.model.pca import PCA
+from jaxshape.model.shapes import decode, encode
 from jaxshape.search.config import RefineConfig
-from jaxshape.search.objective import PAPER
 from jaxshape.search.reconstruction import (
     code_penalty,
     compose,
     fit_surface,
+    reconstruct,
     reconstruct_jit,
     refiner_for,
     require_measured,
     search_space,
 )
 from jaxshape.search.refiner import StopReason
+from jaxshape.search.residuals import BALANCED, PAPER, Residual, cross_entropy
 
 KEY = jax.random.key(0)
 KEYS = jax.random.split(KEY, 2)
@@ -30,6 +33,7 @@ CONFIG = RefineConfig(iterations=4, population=8, sigma0=0.2)
 OCCUPIED, OCCLUDED = jax.random.bernoulli(KEY, jnp.array([0.1, 0.5])[:, None, None, None, None],
                                           (2, 2, 32, 32, 32))  # fmt: skip
 OCCLUDED = OCCLUDED & ~OCCUPIED
+GRIDS = Grids(OCCUPIED, OCCLUDED)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +62,7 @@ def test_composing_keeps_what_was_observed_and_fills_the_rest(occupied, occluded
 
 
 def test_the_encoder_alone_answers_with_its_first_code(linear_prior, encoded):
-    first_code = reconstruction.encode(linear_prior.params, OCCUPIED)
+    first_code = encode(linear_prior, GRIDS)
     np.testing.assert_allclose(encoded.first_code, first_code, rtol=1e-4, atol=1e-5)
     np.testing.assert_array_equal(encoded.code, encoded.first_code)
     np.testing.assert_array_equal(encoded.completed, encoded.completed_first)
@@ -75,11 +79,11 @@ def test_a_search_starts_from_the_encoder_and_lowers_the_objective(encoded, sear
 
 
 def test_all_fields_belong_to_the_refined_code(linear_prior, searched):
-    logits = reconstruction.decode(linear_prior.params, searched.code)
+    logits = decode(linear_prior, searched.code)
     np.testing.assert_allclose(searched.logits, logits, atol=1e-4)
     np.testing.assert_array_equal(searched.completed, searched.logits > 0)
-    first_logits = reconstruction.decode(linear_prior.params, searched.first_code)
-    loss = cross_entropy(searched.logits, target(OCCUPIED, OCCLUDED, first_logits))
+    first_logits = decode(linear_prior, searched.first_code)
+    loss = cross_entropy(searched.logits, BALANCED.target(GRIDS, first_logits))
     np.testing.assert_allclose(searched.objective, loss, rtol=1e-5)
     np.testing.assert_array_equal(
         searched.composed, compose(OCCUPIED, OCCLUDED, searched.completed)
@@ -89,7 +93,7 @@ def test_all_fields_belong_to_the_refined_code(linear_prior, searched):
 def test_the_paper_objective_weighs_free_space_in_full(linear_prior, encoded):
     paper = reconstruct_jit(None, replace(CONFIG, objective="paper"))
     printed = paper(KEYS, linear_prior, OCCUPIED, OCCLUDED)
-    weights = target(OCCUPIED, OCCLUDED, encoded.logits, PAPER)
+    weights = PAPER.target(GRIDS, encoded.logits)
     np.testing.assert_allclose(printed.objective, cross_entropy(encoded.logits, weights), rtol=1e-5)
     assert np.all(printed.objective > encoded.objective)
 
@@ -146,8 +150,8 @@ def test_in_the_raw_space_points_are_codes(skewed):
     slope = jax.grad(
         lambda code: jnp.sum(
             cross_entropy(
-                reconstruction.decode(skewed.params, code),
-                target(OCCUPIED, OCCLUDED, reconstruction.decode(skewed.params, found.first_code)),
+                decode(skewed, code),
+                BALANCED.target(GRIDS, decode(skewed, found.first_code)),
             )
         )
     )(found.first_code)
@@ -199,9 +203,57 @@ def test_nothing_measured_is_said_in_a_sentence():
         require_measured(jnp.zeros((4, 4, 4), bool))
 
 
-def test_a_surface_that_the_space_holds_is_found_from_any_code(linear_prior, monkeypatch):
+def test_a_surface_that_the_space_holds_is_found_from_any_code(linear_prior):
     codes = 3 * jax.random.normal(jax.random.key(6), (2, 10))
-    surface = reconstruction.decode(linear_prior.params, codes) > 0
-    monkeypatch.setattr(reconstruction, "encode", lambda params, grid: jnp.zeros((2, 10)))
-    fitted = jax.jit(fit_surface)(linear_prior, surface)
+    surface = decode(linear_prior, codes) > 0
+    at_zero = replace(PCA, encode=lambda params, grids: jnp.zeros((2, 10)))
+    fitted = jax.jit(fit_surface)(linear_prior._replace(model=at_zero), surface)
     assert (iou(fitted, surface) > 0.8).all()
+
+
+# --- what is given --------------------------------------------------------------------------------
+
+
+def test_one_key_serves_a_batch(linear_prior, searched):
+    run = reconstruct_jit(refiner_for("cma", linear_prior, CONFIG), CONFIG)
+    found = run(KEY, linear_prior, OCCUPIED, OCCLUDED)
+    np.testing.assert_array_equal(found.code, searched.code)
+
+
+@pytest.mark.parametrize(
+    "occupied, occluded, said",
+    [
+        (OCCUPIED[0], OCCLUDED[0], r"occupied has shape \(32, 32, 32\).*occupied\[None\]"),
+        (OCCUPIED, OCCLUDED[:1], r"occluded \(1, 32, 32, 32\); give both as"),
+        (jnp.zeros((1, 64, 64, 64), bool), jnp.zeros((1, 64, 64, 64), bool),
+         r"this prior knows shapes of 32 x 32 x 32 voxels"),
+    ],
+)  # fmt: skip
+def test_grids_that_do_not_fit_are_named(linear_prior, unchecked_types, occupied, occluded, said):
+    with pytest.raises(ValueError, match=said):
+        reconstruct(KEY, linear_prior, occupied, occluded, None, CONFIG)
+
+
+def test_a_singular_covariance_still_leaves_a_space_to_search_in(linear_prior):
+    """Codes of a training set may leave out directions; they used to end in NaN."""
+    singular = linear_prior._replace(code_covariance=jnp.diag(jnp.arange(10.0)))
+    found = searching(singular)
+    assert np.all(np.isfinite(found.logits)) and np.all(found.objective < found.first_objective)
+    with pytest.raises(ValueError, match="not positive semi-definite"):
+        search_space(linear_prior._replace(code_covariance=-jnp.eye(10)), CONFIG)
+
+
+def test_own_data_reaches_the_residual_of_its_object(linear_prior):
+    residual = Residual(lambda grids, first: grids.data, lambda logits, data: data * logits.mean())
+    config = replace(CONFIG, iterations=1)
+    run = reconstruct_jit(refiner_for("gradient", linear_prior, config), config, residual)
+    found = run(KEY, linear_prior, OCCUPIED, OCCLUDED, data=jnp.array([1.0, -1.0]))
+    moved = found.logits.mean((1, 2, 3)) - decode(linear_prior, found.first_code).mean((1, 2, 3))
+    assert moved[0] < 0 < moved[1]
+
+
+def test_soft_grids_are_rounded_in_the_composed_shape(linear_prior):
+    soft = jnp.where(OCCUPIED, 0.8, 0.3), jnp.where(OCCLUDED, 0.7, 0.1)
+    found = reconstruct_jit(None, replace(CONFIG, objective="soft"))(KEYS, linear_prior, *soft)
+    expected = compose(OCCUPIED, OCCLUDED, found.completed)
+    np.testing.assert_array_equal(found.composed, expected)

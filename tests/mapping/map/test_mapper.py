@@ -56,7 +56,8 @@ def build(shy_prior):
 @pytest.fixture(scope="module")
 def shy_prior(linear_prior):
     """Its shapes are all but empty, so that they do not disturb the tracking."""
-    return linear_prior._replace(params=0.01 * linear_prior.params)
+    shy = 0.01 * linear_prior.params["components"]
+    return linear_prior._replace(params=linear_prior.params | {"components": shy})
 
 
 @pytest.fixture(scope="module")
