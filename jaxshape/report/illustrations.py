@@ -29,10 +29,18 @@ _FRUSTUM = 0.12  # length of a drawn camera, in radii of the scene
 
 
 class Picture(NamedTuple):
+    """A picture of the report.
+
+    Attributes:
+        title: Text above the picture.
+        uri: The picture as a data URI.
+        description: Text for those who cannot see it.
+        note: Text below the picture.
+    """
+
     title: str
     uri: str
     description: str
-    """For those who cannot see it."""
     note: str = ""
 
 

@@ -31,16 +31,22 @@ OBJECTS_AT_A_TIME = 16
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """What decides the figures of an evaluation, besides the meshes and the weights."""
+    """Settings of an evaluation, besides the meshes and the weights.
+
+    Attributes:
+        frames: Numbers of frames to fuse, each 1 or more: the first k of the orbit.
+        methods: Names of the searches, see `jaxshape.search.methods`; "encoder" searches nothing.
+        noise: Add the faults of a real sensor to the depth images.
+        ceiling: Add to the bounds the best that the space could hold, `fit_surface`, whatever was
+            seen.
+        refine: Settings of the searches.
+        seed: Seed of noise, surface samples and searches, 0 or more.
+    """
 
     frames: tuple[int, ...] = (1, 4, 8, 18)
-    """Numbers of frames to fuse: the first k of the orbit."""
     methods: tuple[str, ...] = ("encoder", "gradient", "cma")
-    """By name, see `jaxshape.search.methods`; "encoder" searches nothing."""
     noise: bool = False
-    """Add the faults of a real sensor to the depth images."""
     ceiling: bool = False
-    """Add to the bounds the best that the space could hold, `fit_surface`, whatever was seen."""
     refine: RefineConfig = field(default_factory=RefineConfig)
     seed: int = 0
 
@@ -49,7 +55,13 @@ NOTHING = "No pixel of some number of frames meets the mesh: it is too thin for 
 
 
 class Case(NamedTuple):
-    """One object after one number of frames; batched over both."""
+    """One object after one number of frames; batched over both.
+
+    Attributes:
+        occupied: F `[*case x y z]`.
+        occluded: M `[*case x y z]`.
+        surface: True surface voxels `[*case x y z]`.
+    """
 
     occupied: Bool[Array, "*case x y z"]
     occluded: Bool[Array, "*case x y z"]
@@ -119,10 +131,17 @@ def evaluate(
 def by_each_method(
     prior: ShapePrior, config: EvaluateConfig
 ) -> Callable[..., dict[str, Reconstruction]]:
-    """A compiled `reconstruct` by every method; ValueError for a name that is none.
+    """A compiled `reconstruct` by every method.
 
-    In one program, where XLA computes only once what the methods have in common: the first code,
-    its decoded shape and the target.
+    All methods are in one program, where XLA computes only once what they have in common: the first
+    code, its decoded shape and the target.
+
+    Args:
+        prior: The shape prior.
+        config: Settings of the evaluation.
+
+    Raises:
+        ValueError: There is no such method.
     """
     refiners = {name: refiner_for(name, prior, config.refine) for name in config.methods}
 

@@ -19,40 +19,53 @@ IMAGES = ("image", "depth", "mask")
 
 
 class KeyframeRecord(NamedTuple):
-    """A fused frame; `None` for what is not known of it."""
+    """A fused frame of a result folder.
+
+    Attributes:
+        name: Name of the frame.
+        T_world_camera: Pose of the frame `[4 4]`; None where it is not known.
+        files: Files of its image, depth and mask that are there.
+        figures: All entries of keyframes.json for the frame.
+    """
 
     name: str
     T_world_camera: Float[np.ndarray, "4 4"] | None
     files: dict[str, Path]
-    """Those of its image, depth and mask that are there."""
     figures: dict[str, Any]
-    """All that keyframes.json says of it."""
 
 
 class ResultFolder(NamedTuple):
-    """The content of a result folder; what is missing is empty or `None`."""
+    """The content of a result folder; missing parts are empty or None.
+
+    Attributes:
+        name: Name of the folder.
+        result: Content of result.json.
+        mesh: Mesh in the world frame, in metres.
+        grids: Grids of `GRIDS` that are there.
+        origin: Object-frame position of voxel coordinate (0, 0, 0), in metres.
+        voxel_size: Edge lengths of one voxel, in metres.
+        T_object_world: World to object frame `[4 4]`.
+        intrinsics: fx, fy, cx, cy of the frames, in pixels.
+        shape: Height and width of the frames, in pixels.
+        keyframes: The keyframes, in their order.
+        frames: Index, name, status and reason of every frame of the recording.
+        trajectory: Segments of the camera's path in the object frame `[s 2 3]`, in metres.
+        problems: A sentence for each file that cannot be read.
+    """
 
     name: str
     result: dict[str, Any]
-    """The content of result.json."""
     mesh: trimesh.Trimesh | None
-    """In the world frame, metres."""
     grids: dict[str, Bool[np.ndarray, "x y z"]]
-    """Those of `GRIDS` that are there."""
     origin: Float[np.ndarray, " 3"]
     voxel_size: Float[np.ndarray, " 3"]
     T_object_world: Float[np.ndarray, "4 4"]
     intrinsics: tuple[float, float, float, float] | None
-    """fx, fy, cx, cy in pixels."""
     shape: tuple[int, int] | None
-    """Height and width of the frames."""
     keyframes: list[KeyframeRecord]
     frames: list[dict[str, Any]]
-    """Index, name, status and reason of every frame of the recording."""
     trajectory: Float[np.ndarray, "s 2 3"]
-    """Segments of the camera's path in the object frame, metres."""
     problems: list[str]
-    """A sentence for each file that cannot be read."""
 
 
 def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:

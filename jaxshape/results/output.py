@@ -22,15 +22,15 @@ SMOOTHING = 20
 
 
 class Observation(NamedTuple):
-    """What was measured of one object, and where its grid lies.
+    """Measurement of one object, and the place of its grid.
 
     Attributes:
-        depth: A few depth frames to show, in metres.
-        occupied: F.
-        occluded: M.
-        frame: Of the grid, in the object frame.
-        T_world_object: The object's pose.
-        truth: The complete surface, where it is known.
+        depth: Some depth images to show, in metres.
+        occupied: F `[x y z]`, binary.
+        occluded: M `[x y z]`, binary.
+        frame: Voxel frame of the grid, in the object frame.
+        T_world_object: Pose of the object `[4 4]`.
+        truth: Complete surface of the object `[x y z]`; None where it is not known.
     """
 
     depth: Sequence[Float[np.ndarray, "_ _"]]

@@ -9,9 +9,16 @@ from jaxshape.results.folder import KeyframeRecord, ResultFolder
 
 
 class Figure(NamedTuple):
+    """A figure of a result, in words.
+
+    Attributes:
+        name: Name of the figure.
+        value: Its value, with a unit.
+        meaning: What it says.
+    """
+
     name: str
     value: str
-    """With its unit."""
     meaning: str
 
 

@@ -18,14 +18,17 @@ class TraceError(ValueError):
 
 
 class Search(NamedTuple):
-    """One search as its result folder tells of it."""
+    """One search of a result folder.
+
+    Attributes:
+        name: Name of the folder.
+        trace: Trace of the search, NumPy arrays with one row per iteration.
+        result: Content of result.json.
+    """
 
     name: str
-    """Of the folder."""
     trace: Trace
-    """NumPy arrays with one row per iteration."""
     result: dict[str, Any]
-    """The content of result.json."""
 
 
 def write_trace(path: str | os.PathLike[str], trace: Trace) -> None:

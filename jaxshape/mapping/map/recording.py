@@ -62,7 +62,7 @@ class Progress(NamedTuple):
     """A map and the outcome of the frames so far.
 
     Attributes:
-        state: The map.
+        state: The map after the last frame.
         start: The object as it was found in the first frame, with its latest box.
         logs: Outcome of each frame so far.
         shape: The shape as last refined, a batch of one; None where nothing was measured yet, or
@@ -90,7 +90,7 @@ def follow(
     A damaged frame or a pose in doubt costs that frame alone and is written down in its `FrameLog`.
 
     Args:
-        sequence: The recording.
+        sequence: The recording, from `open_sequence`.
         start: The object in the first frame, from `find_start`.
         mapper: Tracking and mapping, from `build_mapper`.
         prior: The shape prior, which estimates the object's box again as keyframes are added.

@@ -85,7 +85,7 @@ def find_start(
     and placed by the prior (`place`), upright on the floor if that is seen.
 
     Args:
-        sequence: The recording.
+        sequence: The recording, from `open_sequence`.
         prior: The shape prior, of whose class the object is.
         prompt: Where the object is in the image; `Prompt()` looks in the middle of several frames.
         box: The object's box, in the world of the given poses or, without these, of the camera of

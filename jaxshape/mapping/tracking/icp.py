@@ -192,9 +192,18 @@ def align(
 
 
 class _System(NamedTuple):
-    """Normal equations over translation and rotation about `center`.
+    """Normal equations of one step over translation and rotation.
 
     Rotation has the unit 1 / `radius`, so that all six unknowns are lengths.
+
+    Attributes:
+        hessian: Matrix of the equations `[6 6]`.
+        gradient: Right side of the equations, with opposite sign `[6]`.
+        center: Point about which the cloud is rotated, the weighted mean of its points, in metres.
+        radius: Root mean square distance of the points from the centre, in metres.
+        inliers: Points that agree with a match.
+        in_reach: Points that should have a match.
+        rmse: Root mean square distance of inliers to the planes of their matches, in metres.
     """
 
     hessian: Float[Array, "6 6"]
