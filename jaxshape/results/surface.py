@@ -38,6 +38,9 @@ def surface(
         T_world_object: Rigid motion from the object frame to the world `[4 4]`; None leaves the
             mesh in the object frame.
 
+    Returns:
+        A closed triangle mesh whose vertices are in metres.
+
     Raises:
         ValueError: No voxel is above the level, values are not finite, or the level is outside (0,
             1).
