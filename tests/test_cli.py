@@ -263,18 +263,18 @@ def test_options_of_an_evaluation_out_of_range_are_refused(
     assert said in refused("evaluate", *some, *options)
 
 
-def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior, linear):
+def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior):
     save_prior(tmp_path / "tiny.safetensors", prior, {})
     tiny = ("--weights", tmp_path / "tiny.safetensors")
     (tmp_path / "empty.ply").write_bytes(b"")
-    said = refused("evaluate", *linear, "--meshes", tmp_path / "empty.ply", *tiny)
+    said = refused("evaluate", "--meshes", tmp_path / "empty.ply", *tiny)
     assert "None of the 1 meshes can be used" in said and "empty" in said
-    refused("evaluate", *linear, "--meshes", tmp_path / "nowhere.ply", *tiny)
+    refused("evaluate", "--meshes", tmp_path / "nowhere.ply", *tiny)
 
     lying = trimesh.load_mesh(chair)
     lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     lying.export(tmp_path / "lying.ply")
-    said = refused("evaluate", *linear, "--meshes", tmp_path / "lying.ply")
+    said = refused("evaluate", "--meshes", tmp_path / "lying.ply")
     assert "lie on their side" in said and "--up z" in said
 
 
@@ -362,11 +362,11 @@ def test_reconstruct_writes_its_files(run, frames, tmp_path, linear):
     assert "frame-000001: unreadable" in err and "cannot be read as an image" in err
     assert "objective:" in out and str(output) in out
 
-    status, out, err = run("plot", *linear, output)
+    status, out, err = run("plot", output)
     assert status == 0 and str(output / "trace.png") in out, err
     plot_search(tmp_path / "again.png", read_search(output))
     assert (tmp_path / "again.png").read_bytes() == (output / "trace.png").read_bytes()
-    status, out, err = run("plot", *linear, output, output, "--output", tmp_path / "compare.svg")
+    status, out, err = run("plot", output, output, "--output", tmp_path / "compare.svg")
     assert status == 0 and (tmp_path / "compare.svg").exists(), err
 
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import tyro
 
 from jaxshape.cli.common import console, progress_bar, report_skipped, require
-from jaxshape.cli.options import Axes, Machines, checked_training
+from jaxshape.cli.options import Axes, Machines
 from jaxshape.cli.scoring import load_models, score
 from jaxshape.data.config import DatasetConfig
 from jaxshape.files import write_json, write_text
@@ -88,11 +88,13 @@ def preset_in(arguments: Sequence[str]) -> TrainConfig:
 
 @dataclass(frozen=True)
 class Train:
-    """Train the auto-encoder on a dataset, or on a folder of meshes; the same command resumes.
+    """Train a shape prior on a dataset, or on a folder of meshes; the same command resumes.
 
     Examples: jaxshape train --dataset data/chairs --output out/train
 
     jaxshape train --meshes mugs/ --name mug --up z --front -y
+
+    jaxshape train --dataset data/chairs --model pca
 
     With --meshes, about every tenth mesh is kept out of training and scored afterwards.
     """
@@ -111,6 +113,9 @@ class Train:
     """Weights to begin with, of the same sizes, instead of random ones."""
     licence: str = "not stated"
     """Licence of the weights, for their card; the licence of the meshes may restrict it."""
+    model: Literal["autoencoder", "pca"] = "autoencoder"
+    """The paper's network, or principal components of the complete surfaces: a cheap rival, made in
+    seconds, of which --code numbers and --seed are the only settings."""
     preset: Preset = "default"
     """Defaults of the options below: the best that we found, or the paper's own, which
     `jaxshape train --preset paper --help` shows."""
@@ -121,7 +126,6 @@ class Train:
         from jaxshape.data.dataset import open_dataset
         from jaxshape.model.weights import load_prior
 
-        checked_training(self.config)
         require(
             (self.dataset is None) != (self.meshes is None),
             "Give either --dataset FOLDER or --meshes FOLDER, to say what to train on.",
@@ -137,11 +141,23 @@ class Train:
         if folder is None:
             folder, held_out = self.build(output)
         data = open_dataset(folder)
-        is_first = _fit(output, data, self.config, start)
-        if is_first:
+        prior = self.fit(output, data, start)
+        if prior is not None:
             about = json.loads((folder / "dataset.json").read_text())
             about |= {"source": str(self.meshes or self.dataset), "used": len(data.names)}
-            self.write(output, data, about, held_out)
+            self.write(output, prior, about, held_out)
+
+    def fit(self, output: Path, data: Any, start: Any) -> Any:
+        """The trained prior; None in all processes but the one that writes it."""
+        if self.model == "pca":
+            from jaxshape.data.dataset import surfaces
+            from jaxshape.model.pca import fit
+
+            return fit(surfaces(data), self.config.architecture.code, self.config.seed)
+        from jaxshape.model.training import finished_prior
+
+        is_first = _fit(output, data, self.config, start)
+        return finished_prior(output, data, self.config) if is_first else None
 
     def build(self, output: Path) -> tuple[Path, tuple[list[Any], list[Any]]]:
         """The folder of a dataset of --meshes; the models kept out of it, and those skipped."""
@@ -158,27 +174,24 @@ class Train:
         )
         training, held_out = hold_out(list_meshes(self.meshes))
         models = load_models(held_out, self.axes)  # refused now, not after hours of training
-        config = DatasetConfig(up=self.axes.up, front=self.axes.front, seed=self.config.seed)
+        config = DatasetConfig(
+            up=self.axes.up,
+            front=self.axes.front,
+            resolution=self.config.architecture.resolution,
+            seed=self.config.seed,
+        )
         build(output / "dataset", training, config, PROCESSORS)
         return output / "dataset", models
 
-    def write(self, output: Path, data: Any, about: dict[str, Any], held_out: Any) -> None:
+    def write(self, output: Path, prior: Any, about: dict[str, Any], held_out: Any) -> None:
         """Write the weights and cards of a finished run, and score it on what was held out."""
-        from jaxshape.model.training import finished_prior, read_metrics
         from jaxshape.model.weights import load_prior, save_prior
-        from jaxshape.report.card import describe, training_card
+        from jaxshape.report.card import describe
         from jaxshape.results.evaluation import EvaluateConfig
 
-        card = training_card(
-            self.config,
-            read_metrics(output),
-            about,
-            start=self.start,
-            command=shlex.join(["jaxshape", *sys.argv[1:]]),
-            licence=self.licence,
-        )
+        card = self.card(output, about)
         weights = output / f"{self.name}.safetensors"
-        save_prior(weights, finished_prior(output, data, self.config), card)
+        save_prior(weights, prior, card)
         write_json(output / "card.json", card)
         scores = None
         if held_out:
@@ -192,6 +205,19 @@ class Train:
             scores = score(output / "evaluation.json", prior, config, settings, *held_out)
         write_text(output / f"{self.name}.md", describe(self.name, card, scores))
         print(f"wrote {weights} and its card, {self.name}.md")
+
+    def card(self, output: Path, about: dict[str, Any]) -> dict[str, Any]:
+        """The model card."""
+        from jaxshape.model.training import read_metrics
+        from jaxshape.report.card import basis_card, training_card
+
+        given = {
+            "command": shlex.join(["jaxshape", *sys.argv[1:]]),
+            "licence": self.licence,
+        }
+        if self.model == "pca":
+            return basis_card(self.config, about, **given)
+        return training_card(self.config, read_metrics(output), about, start=self.start, **given)
 
 
 def _fit(output: Path, data: Any, config: TrainConfig, start: Any) -> bool:

@@ -1,6 +1,5 @@
 """Options that several commands take, and the ranges in which they make sense."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import wraps
@@ -12,7 +11,6 @@ from jaxshape import process
 from jaxshape.checks import BadSetting
 from jaxshape.cli.common import require
 from jaxshape.data.config import Axis, check_axes
-from jaxshape.model.config import TrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,29 +105,6 @@ def _refusing(build: Callable[..., Any]) -> Callable[..., Any]:
     return built
 
 
-def checked_training(config: TrainConfig) -> TrainConfig:
-    """The options of a training run, once each is in its range."""
-    sizes = config.architecture
-    _require_each(
-        config,
-        ("steps", config.steps >= 1, "1 or more"),
-        ("batch", config.batch >= 1, "1 or more"),
-        ("learning_rate", _positive(config.learning_rate), "a number above 0"),
-        ("occupied_weight", _positive(config.occupied_weight), "a number above 0"),
-        ("code_noise", 0 <= config.code_noise < math.inf, "0 or more"),
-        ("code_weight", 0 <= config.code_weight < math.inf, "0 or more"),
-        ("report_every", config.report_every >= 1, "1 or more"),
-        ("seed", config.seed >= 0, "a number that is not negative"),
-    )
-    _require_each(
-        sizes,
-        ("encoder", min(sizes.encoder) >= 1, "four numbers of channels from 1 up"),
-        ("decoder", min(sizes.decoder) >= 1, "three numbers of channels from 1 up"),
-        ("code", sizes.code >= 2, "2 or more"),
-    )
-    return config
-
-
 def checked_numbers(text: str, option: str) -> tuple[int, ...]:
     """Different whole numbers from 1 up, given with commas."""
     try:
@@ -141,16 +116,3 @@ def checked_numbers(text: str, option: str) -> tuple[int, ...]:
         f"{option} is {text!r}; give different whole numbers from 1 up, with commas, as in 1,4,8.",
     )
     return numbers
-
-
-def _positive(x: float) -> bool:
-    return 0 < x < math.inf
-
-
-def _require_each(settings: Any, *rules: tuple[str, bool, str]) -> None:
-    """Refuse the first field that is out of range; a rule is its name, whether it is fine, and
-    what is wanted."""
-    for name, is_fine, wanted in rules:
-        given = getattr(settings, name)
-        given = " ".join(map(str, given)) if isinstance(given, tuple) else given
-        require(is_fine, f"--{name.replace('_', '-')} is {given}; give {wanted}.")

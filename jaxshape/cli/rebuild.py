@@ -94,7 +94,13 @@ class Demo(Rebuild):
         mesh = random_chair(TEST_SEEDS + self.seed)
         # As near as a Kinect's 57 degrees allow: what it measures gets worse with distance squared.
         T_object_camera = jax.jit(lambda: camera.orbit(self.frames, float(mesh.scale)))()
-        seen = capture(mesh, T_object_camera, noise=True, seed=self.seed)
+        seen = capture(
+            mesh,
+            T_object_camera,
+            noise=True,
+            seed=self.seed,
+            resolution=prior.resolution,
+        )
         merged = jax.jit(fusion.merge_all)(measure_frames(seen))
         observation = Observation(
             depth=list(np.asarray(seen.depth)[:6]),

@@ -47,6 +47,7 @@ def capture(
     noise: bool,
     seed: int,
     image_size: int = render.IMAGE_SIZE,
+    resolution: int = grid.RESOLUTION,
 ) -> Capture:
     """Look at a mesh from some poses, and find its surface voxels (paper, section 2.3). [host]
 
@@ -60,14 +61,15 @@ def capture(
         noise: Whether to add the faults of a structured-light sensor.
         seed: Seed of the noise and of the surface samples, 0 or more.
         image_size: Pixels along each side of the square images.
+        resolution: Voxels along each axis of the object's grids.
     """
     intrinsics = render.fit_intrinsics(mesh, T_object_camera, image_size)
     depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, image_size)
     if noise:
         depth = render.add_sensor_noise(depth, cosine, np.random.default_rng(seed))
-    frame = grid.fit_box(*jnp.float32(mesh.bounds))
+    frame = grid.fit_box(*jnp.float32(mesh.bounds), resolution=resolution)
     points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
-    return Capture(depth, intrinsics, T_object_camera, frame, discretize(points, frame))
+    return Capture(depth, intrinsics, T_object_camera, frame, discretize(points, frame, resolution))
 
 
 def camera_distance(mesh: trimesh.Trimesh) -> float:
@@ -75,10 +77,12 @@ def camera_distance(mesh: trimesh.Trimesh) -> float:
     return render.DISTANCE * float(mesh.scale)
 
 
-@jax.jit
-def discretize(points: Float[Array, "n 3"], frame: GridFrame) -> Bool[Array, "x y z"]:
+@partial(jax.jit, static_argnums=2)
+def discretize(
+    points: Float[Array, "n 3"], frame: GridFrame, resolution: int = grid.RESOLUTION
+) -> Bool[Array, "x y z"]:
     """Surface voxels of object-frame points: `D(P)` of the paper."""
-    return fusion.count_points(grid.voxel_from_object(frame, points)) > 0
+    return fusion.count_points(grid.voxel_from_object(frame, points), resolution) > 0
 
 
 @jax.jit
@@ -94,6 +98,11 @@ def measure_frames(captured: Capture) -> Measurement:
         One measurement for each frame `[views x y z]`; `merge_all` merges them.
     """
     depth = jnp.asarray(captured.depth)
-    measure = partial(fusion.measure, intrinsics=captured.intrinsics, frame=captured.frame)
+    measure = partial(
+        fusion.measure,
+        intrinsics=captured.intrinsics,
+        frame=captured.frame,
+        resolution=captured.surface.shape[-1],
+    )
     one = lambda depth, T: measure(depth, jnp.isfinite(depth), T_object_camera=T)  # noqa: E731
     return jax.vmap(one)(depth, captured.T_object_camera)

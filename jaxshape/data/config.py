@@ -38,6 +38,7 @@ class DatasetConfig:
         noisy: Share of the objects whose depth images get the faults of a real sensor, from 0 to 1.
         up: Axis of the mesh files that points up.
         front: Axis of the mesh files along which the object's front looks.
+        resolution: Voxels along each axis of the grids: 8, 16, 32, 64 or 128 (paper: 32).
         seed: Seed of views, noise and surface samples, 0 or more.
 
     Raises:
@@ -48,9 +49,11 @@ class DatasetConfig:
     noisy: float = 0.5
     up: Axis = "y"
     front: Axis = "z"
+    resolution: int = 32
     seed: int = 0
 
     def __post_init__(self) -> None:
+        checks.one_of("resolution", self.resolution, (8, 16, 32, 64, 128))
         checks.whole("views", self.views, 1)
         checks.within("noisy", self.noisy, 0, 1)
         check_axes(self.up, self.front)

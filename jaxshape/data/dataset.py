@@ -1,7 +1,7 @@
 """Training pairs on disk: partial views and complete surfaces of many objects. [host]
 
 A dataset is a folder of shards. A shard holds up to `OBJECTS_PER_SHARD` objects in one `.npy` of
-bit-packed grids, `[object, 1 + view, 4096]` bytes, where entry 0 is the complete surface **Y** and
+bit-packed grids, `[object, 1 + view, bytes]`, where entry 0 is the complete surface **Y** and
 the others are the measurements **F** of one frame each; a `.json` beside it names its objects and
 what was skipped. Shards are written whole or not at all, so a killed build goes on where it
 stopped, and a finished one has nothing left to do.
@@ -16,7 +16,7 @@ from dataclasses import asdict
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -31,7 +31,6 @@ from jaxshape.data.config import DatasetConfig
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import camera, fusion
-from jaxshape.geometry.grid import RESOLUTION
 
 OBJECTS_PER_SHARD = 64
 
@@ -76,7 +75,13 @@ def training_grids(
     """The complete surface of one object and its views, packed."""
     key = jax.random.key(seed)
     T_object_camera = camera.random_views(key, config.views, camera_distance(mesh))
-    captured = capture(mesh, T_object_camera, noise=_draws_noise(config, seed), seed=seed)
+    captured = capture(
+        mesh,
+        T_object_camera,
+        noise=_draws_noise(config, seed),
+        seed=seed,
+        resolution=config.resolution,
+    )
     views = _occupied_by_frame(captured)
     return pack(np.concatenate([np.asarray(captured.surface)[None], np.asarray(views)]))
 
@@ -108,7 +113,7 @@ def pack(grids: Bool[np.ndarray, "*batch x y z"]) -> UInt8[np.ndarray, "*batch b
 def unpack(packed: UInt8[np.ndarray, "*batch bytes"]) -> Bool[np.ndarray, "*batch x y z"]:
     """The grids that were packed."""
     grids = np.unpackbits(packed, axis=-1).astype(bool)
-    return grids.reshape(*packed.shape[:-1], *[RESOLUTION] * 3)
+    return grids.reshape(*packed.shape[:-1], *[round(grids.shape[-1] ** (1 / 3))] * 3)
 
 
 # ------------------------------------------------------------------ writing
@@ -167,7 +172,7 @@ def _write_shard(
         seed = _object_seed(config, number * OBJECTS_PER_SHARD + i)
         names.append(model.name)
         grids.append(training_grids(model.mesh, config, seed))
-    shape = (0, 1 + config.views, RESOLUTION**3 // 8)
+    shape = (0, 1 + config.views, config.resolution**3 // 8)
     with atomic_path(_shard_path(folder, number, "npy")) as path:
         np.save(path, np.stack(grids) if grids else np.zeros(shape, np.uint8))
     # The names come last: a shard counts as written once they are there.
@@ -186,13 +191,18 @@ def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> No
     claim = {"config": asdict(config), "objects": len(names), "names_sha256": digest}
     path = folder / "dataset.json"
     if path.exists():
-        if json.loads(path.read_text()) != claim:
+        if _of_today(json.loads(path.read_text())) != claim:
             raise DatasetError(
                 f"{str(folder)!r} already holds a dataset of other objects or settings; "
                 "give another folder, or remove this one."
             )
         return
     write_json(path, claim)
+
+
+def _of_today(claim: dict[str, Any]) -> dict[str, Any]:
+    """The claim of a folder, with the defaults of settings that came after it was made."""
+    return claim | {"config": asdict(DatasetConfig()) | claim.get("config", {})}
 
 
 def _shard_path(folder: Path, number: int, suffix: str) -> Path:
@@ -226,10 +236,22 @@ class Dataset(NamedTuple):
         """Views of each object."""
         return self.shards[0].shape[1] - 1
 
+    @property
+    def resolution(self) -> int:
+        """Voxels along each axis of the grids."""
+        return round((8 * self.shards[0].shape[2]) ** (1 / 3))
+
     def packed(self, index: int) -> UInt8[np.ndarray, "view bytes"]:
         """The packed surface of one object, followed by its views."""
         shard, place = self.row[index]
         return self.shards[shard][place]
+
+
+def surfaces(dataset: Dataset, limit: int = 4096) -> Bool[np.ndarray, "n x y z"]:
+    """The complete surfaces of a dataset, at most `limit` of them, evenly chosen."""
+    count = len(dataset.names)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, limit)).astype(int))
+    return unpack(np.stack([dataset.packed(i)[0] for i in chosen]))
 
 
 def open_dataset(folder: str | os.PathLike[str]) -> Dataset:

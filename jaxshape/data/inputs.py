@@ -5,7 +5,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxshape.data.config import InputConfig
 from jaxshape.data.dataset import unpack
-from jaxshape.geometry.grid import RESOLUTION
 
 Grid = Bool[np.ndarray, "x y z"]
 Voxels = Int[np.ndarray, "n 3"]
@@ -32,7 +31,7 @@ def draw_pair(
         measured, surface = measured[::-1], surface[::-1]
     if config.scale:
         size = 1 - config.scale * rng.random(3)
-        corner = (1 - size) * rng.random(3) * RESOLUTION
+        corner = (1 - size) * rng.random(3) * len(surface)
         measured, surface = shrunk(measured, size, corner), shrunk(surface, size, corner)
     return measured, surface
 
@@ -44,7 +43,7 @@ def faulty(view: Grid, config: InputConfig, rng: np.random.Generator) -> Grid:
     if rng.random() < config.missing:
         view = _holed(view, rng)
     if rng.random() < config.pose_error:
-        view = grid_of(voxels_of(view) + rng.integers(-1, 2, 3))
+        view = grid_of(voxels_of(view) + rng.integers(-1, 2, 3), len(view))
     return view
 
 
@@ -52,16 +51,17 @@ def _cut(view: Grid, rng: np.random.Generator) -> Grid:
     """Without up to a quarter of the grid at one of its six sides."""
     kept = view.copy()
     inwards = np.moveaxis(kept, rng.integers(3), 0)[:: 1 if rng.random() < 0.5 else -1]
-    inwards[: rng.integers(1, RESOLUTION // 4 + 1)] = False
+    inwards[: rng.integers(1, len(view) // 4 + 1)] = False
     return kept
 
 
 def _leaked(view: Grid, rng: np.random.Generator) -> Grid:
     """With a patch of floor or wall: part of one of the grid's sides."""
-    low = rng.integers(0, RESOLUTION, 3)
-    high = low + rng.integers(4, RESOLUTION // 2, 3)
+    n = len(view)
+    low = rng.integers(0, n, 3)
+    high = low + rng.integers(n // 8, n // 2, 3)
     side = rng.integers(3)
-    low[side] = 0 if side == 1 else rng.choice([0, RESOLUTION - 1])  # a floor, but no ceiling
+    low[side] = 0 if side == 1 else rng.choice([0, n - 1])  # a floor, but no ceiling
     high[side] = low[side] + 1
     leaked = view.copy()
     leaked[tuple(map(slice, low, high))] = True
@@ -74,7 +74,8 @@ def _holed(view: Grid, rng: np.random.Generator) -> Grid:
     if len(voxels) == 0:
         return view
     offset = voxels - voxels[rng.integers(len(voxels))]
-    return grid_of(voxels[np.sum(offset**2, axis=1) > rng.uniform(2, RESOLUTION / 4) ** 2])
+    kept = voxels[np.sum(offset**2, axis=1) > rng.uniform(2, len(view) / 4) ** 2]
+    return grid_of(kept, len(view))
 
 
 def shrunk(grid: Grid, size: Float[np.ndarray, "3"], corner: Float[np.ndarray, "3"]) -> Grid:
@@ -82,7 +83,7 @@ def shrunk(grid: Grid, size: Float[np.ndarray, "3"], corner: Float[np.ndarray, "
 
     Neighbours stay neighbours or become one, so no surface gets holes.
     """
-    return grid_of(np.floor((voxels_of(grid) + 0.5) * size + corner).astype(int))
+    return grid_of(np.floor((voxels_of(grid) + 0.5) * size + corner).astype(int), len(grid))
 
 
 def voxels_of(grid: Grid) -> Voxels:
@@ -90,9 +91,9 @@ def voxels_of(grid: Grid) -> Voxels:
     return np.stack(np.unravel_index(np.flatnonzero(grid), grid.shape), axis=-1)
 
 
-def grid_of(voxels: Voxels) -> Grid:
+def grid_of(voxels: Voxels, resolution: int) -> Grid:
     """The grid in which these voxels are occupied; those outside it are left out."""
-    inside = voxels[((voxels >= 0) & (voxels < RESOLUTION)).all(axis=1)]
-    grid = np.zeros([RESOLUTION] * 3, bool)
+    inside = voxels[((voxels >= 0) & (voxels < resolution)).all(axis=1)]
+    grid = np.zeros([resolution] * 3, bool)
     grid[tuple(inside.T)] = True
     return grid

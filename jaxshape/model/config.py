@@ -4,10 +4,13 @@ Nothing here imports JAX, so that the command line answers at once.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
+from jaxshape import checks
 from jaxshape.data.config import InputConfig
 
+Optimizer = Literal["muon", "adam"]
+Schedule = Literal["cosine", "constant"]
 Precision = Literal["float32", "bfloat16"]
 """Precision of a decoder's matrix products."""
 
@@ -23,10 +26,10 @@ class Architecture:
         encoder: Channels after each strided convolution, each 1 or more.
         decoder: Channels after each transposed convolution but the last, which has one channel: one
             entry fewer than `encoder`, each 1 or more.
-        code: Numbers in a code, 1 or more (paper: 100).
+        code: Numbers in a code, 2 or more (paper: 100).
 
     Raises:
-        ValueError: The layers of encoder and decoder do not match, or a size is not positive.
+        ValueError: The layers of encoder and decoder do not match, or a size is outside its range.
     """
 
     encoder: tuple[int, ...] = (32, 64, 128, 256)
@@ -34,14 +37,16 @@ class Architecture:
     code: int = 100
 
     def __post_init__(self) -> None:
-        if not self.decoder or len(self.encoder) != len(self.decoder) + 1:
+        for name in ("encoder", "decoder"):
+            if min(getattr(self, name), default=0) < 1:
+                checks.refuse(name, getattr(self, name), "numbers of channels, 1 or more each")
+        checks.whole("code", self.code, 2)
+        if len(self.encoder) != len(self.decoder) + 1:
             raise ValueError(
-                f"encoder has {len(self.encoder)} layers and decoder {len(self.decoder)} entries; "
-                "give at least one entry for the decoder and one more for the encoder, "
-                "such as (32, 64, 128, 256) and (128, 64, 32) for 32 voxels a side."
+                f"The encoder has {len(self.encoder)} layers and the decoder "
+                f"{len(self.decoder)} numbers of channels; give the encoder one more than the "
+                "decoder, such as 32 64 128 256 and 128 64 32 for grids of 32^3 voxels."
             )
-        if min(*self.encoder, *self.decoder, self.code) < 1:
-            raise ValueError(f"{self}: every number of channels and the code are at least 1.")
 
     @property
     def resolution(self) -> int:
@@ -58,39 +63,53 @@ class TrainConfig:
     Attributes:
         architecture: Sizes of the network.
         inputs: How pairs are drawn from the dataset.
-        steps: Batches in all.
-        batch: Pairs in a batch, over all devices.
+        steps: Batches in all, 1 or more.
+        batch: Pairs in a batch, over all devices, 1 or more.
         optimizer: Adam (paper), or Muon, which orthogonalises the steps of the kernels: it reaches
             in a third of the samples what Adam reaches.
-        learning_rate: Peak of the optimiser's step size (paper: 1e-4, of Adam).
+        learning_rate: Peak of the optimiser's step size, above 0 (paper: 1e-4, of Adam).
         schedule: Whether the step size warms up and decays to zero along a cosine, or stays
             constant (paper).
-        occupied_weight: Weight of occupied voxels in the loss (paper: 1). At 1.5 a voxel counts as
-            occupied from a probability of 0.4 on, where the IoU of shapes as uncertain as these is
-            better than at 0.5.
-        code_noise: Standard deviation of noise added to the codes.
-        code_weight: Weight of half the squared length of a code, in nats, in the loss of its grid:
-            with noise of 1, the KL divergence of a variational auto-encoder whose posterior has
-            variance 1.
+        occupied_weight: Weight of occupied voxels in the loss, above 0 (paper: 1). At 1.5 a voxel
+            counts as occupied from a probability of 0.4 on, where the IoU of shapes as uncertain as
+            these is better than at 0.5.
+        code_noise: Standard deviation of noise added to the codes, 0 or more.
+        code_weight: Weight of half the squared length of a code, in nats, in the loss of its grid,
+            0 or more: with noise of 1, the KL divergence of a variational auto-encoder whose
+            posterior has variance 1.
         bfloat16: Compute convolutions in bfloat16; parameters, statistics and Adam stay in float32.
-        report_every: Steps between checkpoints and lines of metrics; a killed run goes on from the
-            last checkpoint.
-        seed: Seed of the first weights and of the batches.
+        report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
+            on from the last checkpoint.
+        seed: Seed of the first weights and of the batches, 0 or more.
+
+    Raises:
+        ValueError: A setting is outside its range.
     """
 
     architecture: Architecture = Architecture()
     inputs: InputConfig = InputConfig()
     steps: int = 10_000
     batch: int = 32
-    optimizer: Literal["muon", "adam"] = "muon"
+    optimizer: Optimizer = "muon"
     learning_rate: float = 4e-3
-    schedule: Literal["cosine", "constant"] = "cosine"
+    schedule: Schedule = "cosine"
     occupied_weight: float = 1.5
     code_noise: float = 0.0
     code_weight: float = 0.0
     bfloat16: bool = False
     report_every: int = 100
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.one_of("optimizer", self.optimizer, get_args(Optimizer))
+        checks.one_of("schedule", self.schedule, get_args(Schedule))
+        for name in ("steps", "batch", "report_every"):
+            checks.whole(name, getattr(self, name), 1)
+        for name in ("learning_rate", "occupied_weight"):
+            checks.positive(name, getattr(self, name))
+        for name in ("code_noise", "code_weight"):
+            checks.at_least(name, getattr(self, name), 0)
+        checks.whole("seed", self.seed, 0)
 
 
 PRESETS = {

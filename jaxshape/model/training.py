@@ -207,6 +207,12 @@ def train(
     settings, or a batch cannot be divided.
     """
     folder = Path(folder)
+    if dataset.resolution != config.architecture.resolution:
+        raise ValueError(
+            f"The dataset holds grids of {dataset.resolution}^3 voxels, and the network has layers "
+            f"for {config.architecture.resolution}^3; give --encoder and --decoder one layer more "
+            "or less, or build the dataset with another --resolution."
+        )
     devices, processes = jax.device_count(), jax.process_count()
     if config.batch % devices:
         raise ValueError(

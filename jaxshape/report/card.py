@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 
+from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.model import weights
 from jaxshape.model.config import TrainConfig
 from jaxshape.model.training import Report
@@ -42,18 +43,30 @@ def training_card(
     `start` the weights it began with, whose own samples are counted under `samples_before`.
     """
     before = weights.load_card(start) if start else {}
-    return {
-        "data": data,
-        "licence": licence,
-        "command": command,
+    return basis_card(config, data, command=command, licence=licence) | {
+        "model": "autoencoder",
         "config": asdict(config),
-        "seed": config.seed,
         "samples": config.steps * config.batch,
         "samples_before": before.get("samples", 0) + before.get("samples_before", 0),
         "start": weights.fingerprint(weights.load_prior(start)) if start else None,
         "training_loss": metrics[-1].loss,
         "training_iou": metrics[-1].iou,
         "training_seconds": round(sum(report.seconds for report in metrics)),
+    }
+
+
+def basis_card(
+    config: TrainConfig, data: dict[str, Any], *, command: str, licence: str
+) -> dict[str, Any]:
+    """The card of principal components; `data` is what `training_card` takes."""
+    return {
+        "model": "pca",
+        "data": data,
+        "licence": licence,
+        "command": command,
+        "code": config.architecture.code,
+        "resolution": data["config"].get("resolution", RESOLUTION),
+        "seed": config.seed,
         "hardware": hardware(),
     }
 
@@ -86,15 +99,13 @@ def hardware() -> str:
 
 def describe(name: str, card: dict[str, Any], scores: dict[str, Any] | None = None) -> str:
     """The card of `name`.safetensors in Markdown, with the figures of an evaluation if any."""
-    sizes = card["config"]["architecture"]
     facts = "\n".join(f"| {fact} | {text} |" for fact, text in _facts(card).items())
     limits = "\n".join(f"- {limit}" for limit in _limits(card, scores))
     return f"""# Model card: {name}.safetensors
 
-A shape prior for jaxshape (`--weights {name}.safetensors`): an auto-encoder of 32^3 grids, encoder
-{_chain(sizes["encoder"])}, decoder {_chain([*sizes["decoder"], 1])}, a code of {sizes["code"]} \
-numbers, with the mean and covariance
-of the training codes.
+A shape prior for jaxshape (`--weights {name}.safetensors`):
+{_model(card)},
+with the mean and covariance of the training codes.
 
 | | |
 |---|---|
@@ -110,12 +121,21 @@ of the training codes.
 """
 
 
+def _model(card: dict[str, Any]) -> str:
+    grids = f"of {card['resolution']}^3 grids, a code of {card['code']} numbers"
+    if card["model"] == "pca":
+        return f"principal components {grids}"
+    sizes = card["config"]["architecture"]
+    encoder, decoder = _chain(sizes["encoder"]), _chain([*sizes["decoder"], 1])
+    return f"an auto-encoder {grids}, encoder {encoder}, decoder {decoder}"
+
+
 def _chain(channels: Sequence[int]) -> str:
     return "-".join(map(str, channels))
 
 
 def _facts(card: dict[str, Any]) -> dict[str, str]:
-    data, config = card["data"], card["config"]
+    data = card["data"]
     left_out = data["objects"] - data["used"]
     facts = {
         "Data": f"{data['used']:,} objects of `{data['source']}`"
@@ -124,6 +144,14 @@ def _facts(card: dict[str, Any]) -> dict[str, str]:
         f"{data['config']['noisy']:.0%} of the objects with sensor noise",
         "Licence": card["licence"],
         "Command": f"`{card['command']}`",
+    }
+    return facts | (_run(card) if card["model"] == "autoencoder" else {})
+
+
+def _run(card: dict[str, Any]) -> dict[str, str]:
+    """The facts of a training run."""
+    config = card["config"]
+    facts = {
         "Training": f"{card['samples']:,} samples, {config['steps']:,} steps of "
         f"{config['batch']}; {config['optimizer'].capitalize()}, {config['schedule']} step size, "
         f"{config['learning_rate']:g} at its peak; "
@@ -156,7 +184,7 @@ meshes are in evaluation.json."""
 def _limits(card: dict[str, Any], scores: dict[str, Any] | None) -> Iterator[str]:
     yield (
         "Knows objects like those it was trained on and no others: upright, front along +z, each "
-        "axis scaled\n  to fill 30 of 32 voxels. What is thinner than a voxel merges with what is "
+        "axis scaled\n  to fill the grid up to a voxel on each side. What is thinner than a voxel merges with what is "
         "beside it."
     )
     if scores is not None:

@@ -113,7 +113,7 @@ def load_state(
         FrameLog(*log)._replace(T_keyframe_camera=None if np.isnan(T).any() else T)
         for log, T in zip(about["logs"], kept["T_keyframe_camera"], strict=True)
     )
-    place = place_of(start.box, room(start), isotropic=isotropic)
+    place = place_of(start.box, prior.resolution, room(start), isotropic=isotropic)
     return Progress(_state(kept, about, start, place, logs, sequence, prior), start, logs)
 
 

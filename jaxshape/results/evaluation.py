@@ -13,6 +13,7 @@ from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.dataset import hash_seed
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.geometry import camera, fusion
+from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.results.metrics import bounds, shape_scores
@@ -68,7 +69,7 @@ class Case(NamedTuple):
     surface: Bool[Array, "*case x y z"]
 
 
-def observe(model: Model, config: EvaluateConfig) -> Case | None:
+def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) -> Case | None:
     """Fuse the first k frames of an orbit at 30 degrees elevation, for every k asked for.
 
     None where some number of frames measured nothing.
@@ -77,7 +78,7 @@ def observe(model: Model, config: EvaluateConfig) -> Case | None:
     # Independent of the other meshes, so that a mesh scores the same in any company.
     seed = hash_seed(config.seed, *model.name.encode())
     T_object_camera = camera.orbit(max(config.frames), camera_distance(mesh))
-    captured = capture(mesh, T_object_camera, noise=config.noise, seed=seed)
+    captured = capture(mesh, T_object_camera, noise=config.noise, seed=seed, resolution=resolution)
     merged = fusion.merge_cumulative(measure_frames(captured))
     chosen = jax.tree.map(lambda x: x[np.array(config.frames) - 1], merged)
     occupied = fusion.occupied(chosen)
@@ -101,7 +102,10 @@ def evaluate(
     group = max(1, OBJECTS_AT_A_TIME // len(config.frames))
     size = min(group, len(models)) * len(config.frames)
     for start in range(0, len(models), group):
-        observed = [(model, observe(model, config)) for model in models[start : start + group]]
+        observed = [
+            (model, observe(model, config, prior.resolution))
+            for model in models[start : start + group]
+        ]
         yield from (Skipped(m.name, "nothing measured", NOTHING) for m, c in observed if c is None)
         seen = [(model, case) for model, case in observed if case is not None]
         if not seen:

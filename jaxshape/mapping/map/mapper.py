@@ -166,7 +166,7 @@ def _init(
     poses_are_given: bool = False,
 ) -> tuple[MapState, Step]:
     """The map of a first frame."""
-    place = place_of(box, room, isotropic=parts.mapping.isotropic)
+    place = place_of(box, parts.prior.resolution, room, isotropic=parts.mapping.isotropic)
     first = keyframe_of(prepared, place, T_world_camera, None)
     state = assemble(parts.prior, place, (first,), prepared.view, poses_are_given=poses_are_given)
     clock = _Clock()
@@ -244,7 +244,7 @@ def _moved(
     parts: _Parts, state: MapState, box: Box, *, room: float = 0.0
 ) -> tuple[MapState, Reconstruction | None]:
     """The same keyframes, mapped in another box."""
-    place = place_of(box, room, isotropic=parts.mapping.isotropic)
+    place = place_of(box, parts.prior.resolution, room, isotropic=parts.mapping.isotropic)
     anew = assemble(
         parts.prior,
         place,

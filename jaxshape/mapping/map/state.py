@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from jaxshape.geometry import fusion
 from jaxshape.geometry.fusion import Measurement
-from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.mapping.map.realign import Odometry, realign
 from jaxshape.mapping.tracking import surfels
 from jaxshape.mapping.tracking.icp import Alignment
@@ -81,10 +80,10 @@ def assemble(
     state = MapState(
         keyframes=keyframes,
         place=place,
-        measurement=fusion.nothing_measured(),
+        measurement=fusion.nothing_measured(prior.resolution),
         sums=surfels.no_sums(),
         code=prior.code_mean if code is None else code,
-        logits=jnp.full((RESOLUTION,) * 3, -jnp.inf) if logits is None else logits,
+        logits=jnp.full((prior.resolution,) * 3, -jnp.inf) if logits is None else logits,
         surface=no_surface(place.lattice),
         view=view,
         T_world_camera=T_world_camera or keyframes[-1].T_world_camera,
@@ -96,7 +95,8 @@ def assemble(
 
 def fused_anew(state: MapState) -> MapState:
     """The state with F, M and the measured surface made from all keyframes where they are now."""
-    state = state._replace(measurement=fusion.nothing_measured(), sums=surfels.no_sums())
+    nothing = fusion.nothing_measured(state.logits.shape[-1])
+    state = state._replace(measurement=nothing, sums=surfels.no_sums())
     for keyframe in state.keyframes:
         state = added(state, keyframe)
     return state
@@ -118,7 +118,12 @@ def added(state: MapState, keyframe: Keyframe) -> MapState:
 def _add(measurement, sums, keyframe: Keyframe, T_object_world, frame, lattice):
     T_object_camera = T_object_world @ keyframe.T_world_camera
     new = fusion.measure(
-        keyframe.depth, keyframe.segmented, keyframe.intrinsics, T_object_camera, frame
+        keyframe.depth,
+        keyframe.segmented,
+        keyframe.intrinsics,
+        T_object_camera,
+        frame,
+        measurement.hits.shape[-1],
     )
     R = keyframe.T_world_camera.rotation().as_matrix()
     points = keyframe.cloud.points @ R.T + keyframe.T_world_camera.translation()

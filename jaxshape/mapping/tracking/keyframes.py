@@ -14,7 +14,7 @@ from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.data.sequences import Frame
 from jaxshape.geometry import grid
 from jaxshape.geometry.camera import Intrinsics, intrinsics_of
-from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.geometry.grid import GridFrame
 from jaxshape.mapping.tracking import icp
 from jaxshape.mapping.tracking.icp import Cloud
 from jaxshape.mapping.tracking.surfels import CELLS, Lattice
@@ -84,18 +84,19 @@ class Place(NamedTuple):
     lattice: Lattice
 
 
-def place_of(box: Box, room: float = 0.0, *, isotropic: bool = False) -> Place:
-    """The voxel frame and the lattice of the surface that fill a box.
+def place_of(box: Box, resolution: int, room: float = 0.0, *, isotropic: bool = False) -> Place:
+    """The voxel frame of a resolution and the lattice of the surface that fill a box.
 
     Args:
         box: The object's box in the world.
+        resolution: Voxels along each axis of the grids.
         room: Share by which the box that cuts out the object is larger.
         isotropic: Whether all axes have one scale.
     """
     fit = grid.fit_box_isotropic if isotropic else grid.fit_box
-    frame = fit(jnp.float32(-box.size / 2), jnp.float32(box.size / 2))
+    frame = fit(jnp.float32(-box.size / 2), jnp.float32(box.size / 2), resolution=resolution)
     R, t = box.T_world_object[:3, :3], box.T_world_object[:3, 3]
-    scale = CELLS / RESOLUTION / np.asarray(frame.voxel_size, np.float64)
+    scale = CELLS / resolution / np.asarray(frame.voxel_size, np.float64)
     linear = scale[:, None] * R.T
     offset = -linear @ t - scale * np.asarray(frame.origin, np.float64)
     cut = box._replace(size=(1 + room) * box.size)

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.geometry.grid import RESOLUTION, flat_index, voxel_centers
+from jaxshape.geometry.grid import flat_index, voxel_centers
 from jaxshape.mapping.tracking.icp import AGREEING, Match, Matches
 
-CELLS = 2 * RESOLUTION
-"""Cells along each axis: half a voxel each, some 1.5 cm on a chair."""
+CELLS = 64
+"""Cells along each axis: some 1.5 cm on a chair."""
 
 FLAT = 0.8
 """Least length of a cell's mean normal: below, several faces share the cell."""
@@ -27,7 +27,7 @@ PREDICTED_DEVIATION = 0.35
 
 _MEASURED_DEVIATION = 0.05  # in cells: what a plane leaves of the surface inside one
 _REACH = 3  # cells within which points find a patch
-_PATCHES = 4096  # of a predicted surface at most
+_PATCHES_BY_FACE = 4  # of a predicted surface at most, by voxels of a face of the grid
 
 
 class Lattice(NamedTuple):
@@ -136,7 +136,7 @@ def measured_surface(lattice: Lattice, sums: Sums) -> Surface:
 
 
 def predicted_surface(lattice: Lattice, completed: Float[Array, "x y z"]) -> Surface:
-    """The middle of a shell of probabilities on the voxel grid, each voxel being 2^3 cells.
+    """The middle of a shell of probabilities on the voxel grid.
 
     A patch lies at the mean of the probable voxels around a probable voxel, its normal along the
     axis in which they spread least; voxels around which they spread alike in all directions, as at
@@ -144,15 +144,16 @@ def predicted_surface(lattice: Lattice, completed: Float[Array, "x y z"]) -> Sur
     """
     solid = jnp.where(completed > 0.5, completed, 0)
     mean, spread = _neighbourhoods(solid)
-    index = jnp.nonzero((solid > 0).ravel(), size=_PATCHES, fill_value=RESOLUTION**3)[0]
-    found = index < RESOLUTION**3
-    mean, spread = mean[index % RESOLUTION**3], spread[index % RESOLUTION**3]
-    to_world = jnp.linalg.inv(lattice.linear) * CELLS / RESOLUTION  # of voxel vectors
+    n, none = completed.shape[-1], completed.size
+    index = jnp.nonzero((solid > 0).ravel(), size=_PATCHES_BY_FACE * n**2, fill_value=none)[0]
+    found = index < none
+    mean, spread = mean[index % none], spread[index % none]
+    to_world = jnp.linalg.inv(lattice.linear) * CELLS / n  # of voxel vectors
     eigenvalues, axes = jnp.linalg.eigh(to_world @ spread @ to_world.T)
     is_flat = eigenvalues[:, 0] < 0.5 * eigenvalues[:, 1]
-    points = (mean - lattice.offset * RESOLUTION / CELLS) @ to_world.T
+    points = (mean - lattice.offset * n / CELLS) @ to_world.T
     cell = jnp.where(found & is_flat, cell_of(lattice, points), CELLS**3)
-    voxel_size = cell_size(lattice) * CELLS / RESOLUTION
+    voxel_size = cell_size(lattice) * CELLS / n
 
     def scatter(values, empty):
         full = jnp.full((CELLS**3, *values.shape[1:]), empty, values.dtype)
@@ -207,7 +208,7 @@ def _neighbourhoods(
     solid: Float[Array, "x y z"],
 ) -> tuple[Float[Array, "c 3"], Float[Array, "c 3 3"]]:
     """Mean position and spread, in voxels, of what fills the 3^3 voxels around each voxel."""
-    n, steps = RESOLUTION, list(product((-1, 0, 1), repeat=3))
+    n, steps = len(solid), list(product((-1, 0, 1), repeat=3))
     padded, offsets = jnp.pad(solid, 1), jnp.array(steps, jnp.float32)
     around = jnp.stack(
         [padded[1 + i : 1 + i + n, 1 + j : 1 + j + n, 1 + k : 1 + k + n] for i, j, k in steps],

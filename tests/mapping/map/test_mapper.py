@@ -225,7 +225,7 @@ def test_cells_are_half_a_voxel_wide():
     turn = np.eye(4)
     turn[:3, :3] = jaxlie.SO3.from_y_radians(0.7).as_matrix()
     turn[:3, 3] = 3, 1, -2
-    place = place_of(Box(turn, np.array([0.5, 0.9, 0.6])), room=0.2)
+    place = place_of(Box(turn, np.array([0.5, 0.9, 0.6])), 32, room=0.2)
     p = np.random.default_rng(0).uniform(-0.2, 0.2, (200, 3))
     voxel = np.asarray(grid.voxel_from_object(place.frame, jnp.float32(p)))
     cell = np.asarray(surfels.cell_of(place.lattice, jnp.float32(p @ turn[:3, :3].T + turn[:3, 3])))

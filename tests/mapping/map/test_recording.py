@@ -208,12 +208,12 @@ def test_points_outside_the_mask_are_not_the_object(followed, copy, given):
 
 
 def test_isotropic_voxels_are_cubes_around_the_same_centre(walk):
-    frame = place_of(walk.box, isotropic=True).frame
+    frame = place_of(walk.box, 32, isotropic=True).frame
     np.testing.assert_allclose(
         frame.voxel_size, walk.box.size.max() / (RESOLUTION - 2 * MARGIN), rtol=1e-5
     )
     np.testing.assert_allclose(frame.origin + 16 * frame.voxel_size, 0, atol=1e-5)
-    assert np.ptp(np.asarray(place_of(walk.box).frame.voxel_size)) > 1e-3
+    assert np.ptp(np.asarray(place_of(walk.box, 32).frame.voxel_size)) > 1e-3
 
 
 # The first frame --------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ def test_a_map_of_more_than_512_keyframes_is_realigned(monkeypatch, linear_prior
         return T
 
     monkeypatch.setattr(map_state, "_realign", solve)
-    place = place_of(Box(np.eye(4), np.ones(3)))
+    place = place_of(Box(np.eye(4), np.ones(3)), 32)
     lens = Intrinsics(*jnp.float32([4, 4, 2, 2]))
     prepared = PreparedFrame(view_of(jnp.ones((4, 4)), lens), jnp.ones((4, 4), bool))
     odometry = (jaxlie.SE3.identity(), jnp.eye(6))
