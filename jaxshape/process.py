@@ -64,10 +64,10 @@ def join_processes(
 
 
 class Processor(NamedTuple):
-    """The machine's processor, as the system tells of it.
+    """The processor of the machine, as the system describes it.
 
     Attributes:
-        name: For people.
+        name: Name of the processor, for people.
         features: The instructions that it knows, such as `avx2`, `avx512f` and `amx_bf16`; empty
             where the system does not tell.
     """

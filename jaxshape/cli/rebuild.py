@@ -45,7 +45,7 @@ class Rebuild:
         return prior, refiner_for(self.method, prior, self.search), self.search
 
     def settings(self) -> dict[str, Any]:
-        """What result.json says of the search."""
+        """Settings of the search for result.json."""
         return {"method": self.method, "seed": self.seed, "search": asdict(self.search)}
 
 

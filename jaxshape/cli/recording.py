@@ -41,7 +41,7 @@ class Reconstruct(Rebuild):
     frame has +y up and its front along +z; the world is that of the poses or, without poses, the
     frame of the first camera."""
     poses: Literal["auto", "given", "first", "none"] = "auto"
-    """Which given poses to use: all (auto: where there are any), the first alone, or none."""
+    """Given poses to use: all (auto: where there are any), the first alone, or none."""
     first: int = 0
     """Number of the first frame, from 0."""
     every: int = 1
@@ -150,7 +150,7 @@ class Reconstruct(Rebuild):
         remove_state(self.output)
 
     def _use_poses(self, sequence: Any) -> bool:
-        """Whether all given poses are used; refuses what cannot be."""
+        """Whether all given poses are used; refuses options that contradict the recording."""
         from jaxshape.data.sequences import poses_look_inverted
 
         if self.poses in ("given", "first"):

@@ -38,7 +38,7 @@ TEST_SEEDS = 1_000_000
 """Procedural chairs from this seed on are for tests; training uses smaller ones."""
 
 Object = int | MeshSource
-"""What can be built into a dataset: the seed of a procedural chair, or a mesh file."""
+"""An object of a dataset: the seed of a procedural chair, or a mesh file."""
 
 
 class DatasetError(ValueError):

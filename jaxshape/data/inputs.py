@@ -48,7 +48,7 @@ def faulty(view: Grid, config: InputConfig, rng: np.random.Generator) -> Grid:
 
 
 def _cut(view: Grid, rng: np.random.Generator) -> Grid:
-    """Without up to a quarter of the grid at one of its six sides."""
+    """The view without up to a quarter of the grid at one of its six sides."""
     kept = view.copy()
     inwards = np.moveaxis(kept, rng.integers(3), 0)[:: 1 if rng.random() < 0.5 else -1]
     inwards[: rng.integers(1, len(view) // 4 + 1)] = False
@@ -56,7 +56,7 @@ def _cut(view: Grid, rng: np.random.Generator) -> Grid:
 
 
 def _leaked(view: Grid, rng: np.random.Generator) -> Grid:
-    """With a patch of floor or wall: part of one of the grid's sides."""
+    """The view with a patch of floor or wall: part of one of the sides of the grid."""
     n = len(view)
     low = rng.integers(0, n, 3)
     high = low + rng.integers(n // 8, n // 2, 3)
@@ -69,7 +69,7 @@ def _leaked(view: Grid, rng: np.random.Generator) -> Grid:
 
 
 def _holed(view: Grid, rng: np.random.Generator) -> Grid:
-    """Without what lies in a ball around one of its voxels."""
+    """The view without the voxels in a ball around one of them."""
     voxels = voxels_of(view)
     if len(voxels) == 0:
         return view

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 DIRECTIONS = ("y", "-y", "z", "-z", "x", "-x")
 
 MARGIN = 0.35
-"""How much better than +y another direction must score to be believed: of 78 upright real seats,
+"""Margin by which another direction must score better than +y: of 78 upright real seats,
 the one that came closest to a false alarm reached 0.28."""
 
 CELLS = 16

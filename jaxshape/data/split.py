@@ -1,4 +1,4 @@
-"""Which meshes of a collection are kept out of training. [host]"""
+"""The meshes of a collection that are kept out of training. [host]"""
 
 import hashlib
 from collections.abc import Sequence

@@ -156,7 +156,7 @@ def count_points(voxels: Float[Array, "n 3"], resolution: int = RESOLUTION) -> I
 
 
 def _count(coordinates: Iterable[Float[Array, "..."]], resolution: int) -> Int[Array, "x y z"]:
-    """How many points fall into each voxel, from their x, y and z."""
+    """Count the points that fall into each voxel, from their x, y and z."""
     index = flat_index(coordinates, resolution).ravel()
     hits = jnp.zeros(resolution**3, jnp.int32).at[index].add(1, mode="drop")
     return hits.reshape((resolution,) * 3)

@@ -285,7 +285,7 @@ def save_checkpoint(folder: Path, state: TrainState, run: str) -> None:
 
 
 def _identity(config: TrainConfig, start: ShapePrior | None) -> str:
-    """What a run must have in common with its checkpoint."""
+    """Settings and start of a run, which its checkpoint must share."""
     return json.dumps(asdict(config) | {"start": start and fingerprint(start)})
 
 

@@ -162,7 +162,7 @@ def _check(model: ShapeModel, params: PyTree, mean, covariance, path: Path) -> N
 
 
 def _wrong_shape(model: ShapeModel, params: PyTree) -> str | None:
-    """What is wrong with the shapes of the parameters, in a few words."""
+    """A few words on the first parameter of a wrong shape; None where all are right."""
     if model.shapes is None:
         return None
     try:
@@ -178,7 +178,7 @@ def _wrong_shape(model: ShapeModel, params: PyTree) -> str | None:
 
 
 def _wrong_statistics(model: ShapeModel, params: PyTree, mean, covariance) -> str | None:
-    """What is wrong with the shapes of the codes' statistics, in a few words."""
+    """A few words on statistics of a wrong shape; None where all are right."""
     if mean is None or covariance is None:
         return "the codes' mean or covariance is missing"
     if mean.ndim != 1 or covariance.shape != mean.shape * 2:

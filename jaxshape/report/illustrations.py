@@ -48,7 +48,7 @@ class Picture(NamedTuple):
 
 
 def scene(found: ResultFolder) -> dict[str, Any]:
-    """What page.js draws: layers in the object frame, and where to look.
+    """The scene that page.js draws: layers in the object frame, and the view.
 
     Numbers travel as base64 of their little-endian bytes; grids as bits, 4 KiB each, of which the
     page makes cubes itself.

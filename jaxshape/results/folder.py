@@ -1,4 +1,4 @@
-"""What a result folder holds, whatever of it is there, for the report and the viewer. [host]
+"""The content of a result folder, as far as it is there, for the report and the viewer. [host]
 
 A folder may be old, half written, or rewritten at this moment: a file that is missing is left out,
 and of one that cannot be read, `problems` tells.

@@ -51,9 +51,9 @@ def write_result(
 
     Args:
         folder: Where to write; made if missing.
-        observation: What was measured of the object.
-        reconstruction: What was found, a batch of one.
-        figures: What `result.json` holds besides, such as the settings.
+        observation: Measurement of the object.
+        reconstruction: The reconstruction, a batch of one.
+        figures: Further entries of `result.json`, such as the settings.
 
     Returns:
         The content of `result.json`: `figures`, the objective before and after in nats per voxel,

@@ -1,4 +1,4 @@
-"""What the reconstruction of a recording leaves on disk, while it runs and when it ends. [host]
+"""Files of the reconstruction of a recording, while it runs and when it ends. [host]
 
     keyframes/       pictures of the keyframes
     keyframes.json   the camera, the keyframes and what became of every frame
@@ -57,7 +57,7 @@ def write_progress(
 
 
 def observation_of(state: MapState, min_hits: int) -> Observation:
-    """What the keyframes of a map measured of the object."""
+    """Measurement of the object by the keyframes of a map."""
     every = max(1, len(state.keyframes) // FRAMES_TO_SHOW)
     shown = state.keyframes[::every][:FRAMES_TO_SHOW]
     return Observation(
@@ -71,7 +71,7 @@ def observation_of(state: MapState, min_hits: int) -> Observation:
 
 
 def counts(progress: Progress) -> dict[str, int]:
-    """How many frames there were, and what became of them."""
+    """Numbers of frames, in all and by status."""
     statuses = [log.status for log in progress.logs]
     return {
         "frames": len(statuses),
@@ -95,7 +95,7 @@ def _crop(depth: np.ndarray, segmented: np.ndarray) -> np.ndarray:
 
 
 def _fused(progress: Progress) -> Iterator[tuple[FrameLog, Keyframe]]:
-    """What became of each keyframe, and what the map keeps of it."""
+    """The log of each keyframe, and the keyframe as the map keeps it."""
     logs = (log for log in progress.logs if log.status == "keyframe")
     return zip(logs, progress.state.keyframes, strict=True)
 

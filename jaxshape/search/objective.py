@@ -17,7 +17,7 @@ Penalty = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 
 class Evaluation(NamedTuple):
-    """How codes are scored, for any objects.
+    """Scoring of codes, for any objects.
 
     Attributes:
         loss: `(shared, code [d], own) -> loss`, under any `jax.vmap`s and `jax.grad`; `own` holds

@@ -1,4 +1,4 @@
-"""What every search over a latent code has in common.
+"""The interface of every search over a latent code.
 
 A `Refiner` is two pure functions over ONE point of the search space (`space.py`). `init` takes the
 first point and its loss, `step` does one iteration; both return the search's state and a `Trace` of
@@ -137,7 +137,7 @@ def advance(
         refiner: The search.
         key: Random key of this iteration.
         state: The search's state.
-        trace: Of the iteration before.
+        trace: Trace of the iteration before.
         objective: The loss of one point. A search that has stopped asks for points that are not
             finite.
 

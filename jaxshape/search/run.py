@@ -154,7 +154,7 @@ def refine(
 
 
 def _evaluation(prior, prepared, residual, penalty, codes, targets) -> Evaluation:
-    """How codes are scored, from the first object of a batch."""
+    """The scoring of codes, with the first object of a batch as an example of shapes."""
     own = pick((prepared.own, targets), 0)
     return evaluation(prior.model, prepared, residual, penalty, codes[0], own)
 

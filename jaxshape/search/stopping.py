@@ -121,7 +121,7 @@ def no_history(point: Float[Array, " d"], population: int) -> History:
 
 
 def _recent(dim: int, population: Any) -> Any:
-    """How many generations pycma's short history holds, 10 + 30 d / population."""
+    """Generations in pycma's short history, 10 + 30 d / population."""
     return 10 + 30 * dim // population
 
 

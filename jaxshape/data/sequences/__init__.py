@@ -58,7 +58,7 @@ LAYOUTS: dict[str, Layout] = {
     "bundlesdf": Layout("depth/*.png, cam_K.txt", folders.fits_bundlesdf, folders.list_bundlesdf),
     "open3d": Layout("depth/*.png", folders.fits_open3d, folders.list_open3d),
 }
-"""In the order in which a folder is tried against them: the last fits whatever has depth images."""
+"""Layouts in the order in which they are tried: the last fits any folder with depth images."""
 
 
 def open_sequence(
@@ -136,7 +136,7 @@ def _checked_layout(name: str) -> str:
 
 
 def _nothing_fits(contents: Contents) -> str:
-    """What was found, what each layout needs, and a folder nearby that fits."""
+    """A sentence on what was found, what each layout needs, and a folder nearby that fits."""
     folder, seen = contents.folder, sorted(contents.folders) + sorted(contents.files)
     found = f"{', '.join(seen[:4])}{', ...' if len(seen) > 4 else ''}" if seen else "nothing"
     needs = "; ".join(f"{name}: {layout.needs}" for name, layout in LAYOUTS.items())

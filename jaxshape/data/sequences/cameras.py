@@ -85,7 +85,7 @@ def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int])
 
 
 def guessed(camera: Camera) -> Finding:
-    """What to say of a camera that nothing vouches for."""
+    """The remark on a camera that is a guess."""
     fx, fy, cx, cy = intrinsic_numbers(camera.intrinsics)
     return Finding(
         f"no camera file; focal lengths {fx:g}, {fy:g} and principal point {cx:g}, {cy:g} are "

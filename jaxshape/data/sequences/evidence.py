@@ -37,7 +37,7 @@ def poses_look_inverted(sequence: Sequence) -> bool:
 
 
 def looks_inverted(agreement: PoseAgreement) -> bool:
-    """Whether an agreement says so clearly."""
+    """Whether an agreement is clearly better with inverted poses."""
     return agreement.inverted > agreement.as_given + 0.1
 
 

@@ -132,7 +132,7 @@ def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
 
 
 def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:
-    """Where frames are missing, by the times of the frames, or else by the numbers in their names.
+    """Gaps between frames, by the times of the frames, or else by the numbers in their names.
 
     A step between frames is a gap when it is half as long again as the usual one.
     """

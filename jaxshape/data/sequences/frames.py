@@ -183,7 +183,7 @@ def read_raw_depth(path: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w
 
 
 def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
-    """What a median depth, in metres, says against the scale it was read with."""
+    """A remark on the depth scale where a median depth, in metres, is implausible."""
     low, high = _PLAUSIBLE_MEDIAN_DEPTH
     if low <= median <= high:
         return None
@@ -195,7 +195,7 @@ def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
 
 
 def likely_depth_scale(median: float, depth_scale: float) -> float:
-    """Of the usual scales, the one at which a median depth becomes that of an object in a room."""
+    """The usual scale at which a median depth becomes that of an object in a room."""
     usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
     return min(USUAL_DEPTH_SCALES, key=lambda scale: abs(np.log(scale / usual)))
 

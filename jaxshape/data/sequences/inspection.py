@@ -1,4 +1,4 @@
-"""What a user should know of a recording: its figures, and warnings with their evidence."""
+"""Inspection of a recording: its figures, and warnings with their evidence."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -138,7 +138,7 @@ def _better_scale(poses: Poses | None, own: float, median: float) -> _Scale | No
 
 
 def _of_scale(median: float, own: float, better: _Scale | None) -> Iterator[Finding]:
-    """What the poses say, and else what the median depth, in metres, does; 0 says nothing."""
+    """A warning of a wrong depth scale, from the poses or else from the median depth, in metres."""
     low, high = _USUAL_DEPTHS
     if better is not None:
         yield Finding(

@@ -1,4 +1,4 @@
-"""What a folder holds, and which of its images belong together: by number, or by time."""
+"""The content of a folder, and the images that belong together, by number or by time."""
 
 import os
 import re
@@ -104,7 +104,7 @@ def numbers_in(name: str) -> tuple[int, ...]:
 
 
 def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | None]:
-    """For each name the file of the same name, else that with the same numbers in its name."""
+    """For each name the file of the same name, else the one with the same numbers in its name."""
     by_number: dict[tuple[int, ...], Path | None] = {}
     for name, path in offered.items():
         by_number[numbers_in(name)] = None if numbers_in(name) in by_number else path

@@ -31,7 +31,7 @@ CORRELATION = 1 / 200
 in common."""
 
 SHAPE_CORRELATION = 1 / 1000
-"""The same of the patches of the refined shape, which is wrong by whole parts, not by patches."""
+"""Share of the patches of the refined shape that count as independent: it errs by whole parts."""
 
 _PATCH_DEVIATION = 0.002  # metres: of a keyframe's mean in a cell, however many points it has
 _ITERATIONS = 8
@@ -171,7 +171,7 @@ def _surface_equations(observed: _Observed, predicted: Surface, tolerance):
 
 
 def _heights_of_shape(predicted: Surface, middle, normal, tolerance):
-    """How high the refined shape lies over the middle of each cell, and the variance of that."""
+    """Height of the refined shape over the middle of each cell, and its variance."""
     cell = cell_of(predicted.lattice, middle)
     near = predicted.nearest.at[cell].get(mode="fill", fill_value=CELLS**3)
     q = predicted.points.at[near].get(mode="fill", fill_value=0.0)

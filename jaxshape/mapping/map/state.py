@@ -170,7 +170,7 @@ def realigned(state: MapState) -> MapState:
 
 
 def realigned_poses(state: MapState) -> list[jaxlie.SE3]:
-    """Where the keyframes agree best with each other and with the refined shape."""
+    """Poses at which the keyframes agree best with each other and with the refined shape."""
     count = len(state.keyframes)
     capacity = capacity_for(count)
     filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - count)]
@@ -192,7 +192,7 @@ def capacity_for(count: int) -> int:
     """The number of keyframes for which realigning is compiled: the next power of two.
 
     Args:
-        count: How many there are, 1 or more.
+        count: Number of keyframes, 1 or more.
 
     Returns:
         8, 16, 32, ...: with each twice as large as the one before, a map that grows is compiled

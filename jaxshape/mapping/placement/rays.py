@@ -86,7 +86,7 @@ def sample_rays(
 def _through_ball(
     rays: Float[Array, "n 3"], center: Float[Array, " 3"], radius: float
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Where rays from the origin enter a ball and leave it, as factors; equal where they miss."""
+    """Factors at which rays from the origin enter a ball and leave it; equal where they miss."""
     squared = jnp.sum(rays**2, axis=-1)
     middle = rays @ center / squared
     half = jnp.sqrt(jnp.maximum(middle**2 - (center @ center - radius**2) / squared, 0))

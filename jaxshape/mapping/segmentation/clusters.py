@@ -34,10 +34,10 @@ FURNITURE = 1.5
 """A cluster longer than this, in metres, is not joined to one that is already chosen."""
 
 HIDDEN = 0.4
-"""How much of the height, in metres, between two parts of an object may be hidden."""
+"""Largest hidden gap in height between two parts of an object, in metres."""
 
 GROWTH = 0.1
-"""How far, in metres, legs may stand outside the footprint of what is above them."""
+"""Largest distance of legs outside the footprint of the parts above them, in metres."""
 
 SMALLEST = 12
 """Clusters of fewer pixels are noise."""

@@ -24,7 +24,7 @@ NEIGHBOURS = 24
 """Points that a hypothesis is fitted to: half a metre of a wall three metres away."""
 
 REFINED = 6
-"""Of the hypotheses with most inliers, how many are refined: the first may lie across a corner."""
+"""Hypotheses that are refined, those with most inliers: the first may lie across a corner."""
 
 MAX_TILT = 65.0
 """Largest angle, in degrees, between the floor's normal and up in the image of a camera in hand."""
@@ -189,7 +189,7 @@ def _floor_evidence(
     points: Float[np.ndarray, "n 3"],
     object_points: Float[np.ndarray, "m 3"] | None,
 ) -> float:
-    """How likely, from 0 to 1, a level plane is the floor."""
+    """Evidence, from 0 to 1, that a level plane is the floor."""
     seen = min(1.0, plane.share / 0.05)
     lowest = nothing_below(plane, points)
     if object_points is None or len(object_points) == 0:

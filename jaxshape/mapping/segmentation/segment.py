@@ -1,4 +1,4 @@
-"""Which pixels of a depth frame show the object (paper, sections 3.1 and 4.3). [host]
+"""Segmentation of the object in a depth frame (paper, sections 3.1 and 4.3). [host]
 
 The paper thresholds depth by hand. Here the floor, the walls and table tops are taken out as
 planes; the rest falls apart into clusters where depth jumps; the cluster in the middle, or under a
@@ -217,7 +217,7 @@ def _prompted(prompt: Prompt, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarra
 
 
 def _target(prompt: Prompt, view: Scene) -> Pixel:
-    """Where in the reduced image, as row and column, the object is expected."""
+    """Row and column of the reduced image at which the object is expected."""
     h, w = view.z.shape
     if prompt.click is not None:
         u, v = prompt.click

@@ -1,4 +1,4 @@
-"""What the map keeps of frames, and where in the world the object's grids lie. [host]"""
+"""Frames as the map keeps them, and the place of the object's grids in the world. [host]"""
 
 from collections.abc import Callable
 from functools import partial

@@ -48,7 +48,7 @@ MULTIPLES = (
     dict.fromkeys(FOLLOW_A_GRADIENT | {"CR_FM_NES", "SV_CMA_ES"}, 2)  # mirrored candidates
     | {"SV_Open_ES": 4}
 )
-"""What the population of a strategy is a multiple of."""
+"""Numbers of which the population of a strategy must be a multiple."""
 
 
 class EvosaxState(NamedTuple):
