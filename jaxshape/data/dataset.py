@@ -106,7 +106,7 @@ def _occupied_by_frame(captured: Capture) -> Bool[Array, "views x y z"]:
 
 
 def pack(grids: Bool[np.ndarray, "*batch x y z"]) -> UInt8[np.ndarray, "*batch bytes"]:
-    """Eight voxels a byte: 4 KiB for a grid."""
+    """Pack grids with eight voxels in a byte: 4 KiB for a grid of 32^3."""
     return np.packbits(grids.reshape(*grids.shape[:-3], -1), axis=-1)
 
 

@@ -70,9 +70,15 @@ class Case(NamedTuple):
 
 
 def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) -> Case | None:
-    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k asked for.
+    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k of the settings.
 
-    None where some number of frames measured nothing.
+    Args:
+        model: The mesh.
+        config: Settings of the evaluation.
+        resolution: Voxels along each axis of the grids.
+
+    Returns:
+        The grids; None where some number of frames measured nothing.
     """
     mesh = model.mesh
     # Independent of the other meshes, so that a mesh scores the same in any company.
@@ -91,12 +97,19 @@ def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) 
 def evaluate(
     prior: ShapePrior, models: Sequence[Model], config: EvaluateConfig
 ) -> Iterator[dict[str, Any] | Skipped]:
-    """Yield the scores of each mesh in turn, as they go under `per_mesh` into the results file.
+    """Score each mesh in turn.
 
-    A mesh of which nothing was measured is yielded as skipped.
+    Meshes are refined in batches; the last batch is filled up with its own first cases so that one
+    compiled program serves all.
 
-    Meshes are refined in batches; the last batch is filled up with its own first cases so that
-    one compiled program serves all.
+    Args:
+        prior: The shape prior.
+        models: The meshes.
+        config: Settings of the evaluation.
+
+    Yields:
+        The scores of each mesh, as they go under `per_mesh` into the results file; a mesh of which
+        nothing was measured is `Skipped`.
     """
     run, fit = by_each_method(prior, config), jax.jit(fit_surface)
     group = max(1, OBJECTS_AT_A_TIME // len(config.frames))

@@ -69,10 +69,16 @@ class ResultFolder(NamedTuple):
 
 
 def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
-    """Read what is there of a folder made by `demo` or `reconstruct`, finished or not.
+    """Read a folder made by `demo` or `reconstruct`, finished or not, as far as it is there.
 
-    Without a grid the object frame is not known; the first keyframe's, turned upright, stands in.
-    `ValueError` where there is no such folder.
+    Without a grid the object frame is not known; the frame of the first keyframe, turned upright,
+    takes its place.
+
+    Args:
+        folder: The result folder.
+
+    Raises:
+        ValueError: There is no such folder.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -37,7 +37,19 @@ def write_progress(
     *,
     running: bool,
 ) -> dict[str, Any]:
-    """Write all but the checkpoint, as far as there is something; returns result.json."""
+    """Write all files of a reconstruction but the checkpoint, as far as there is something.
+
+    Args:
+        folder: The result folder.
+        sequence: The recording.
+        progress: Progress of the run.
+        figures: Further entries of `result.json`.
+        min_hits: Depth points that make a voxel occupied.
+        running: Whether the run goes on.
+
+    Returns:
+        Content of `result.json`.
+    """
     _write_pictures(folder / "keyframes", sequence, progress)
     _write_trajectory(folder, sequence, progress)
     observation = observation_of(progress.state, min_hits)

@@ -74,7 +74,7 @@ class Poses(NamedTuple):
 
 
 def depths_of(sequence: Sequence) -> Depths:
-    """Look at some depth images; raises the first's `SequenceError` if none can be read."""
+    """Figures of some depth images; raises the `SequenceError` of the first if none can be read."""
     raw, damaged = [], []
     for index in _sampled(sequence):
         try:
