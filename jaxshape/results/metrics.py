@@ -36,7 +36,7 @@ def bounds(
 ) -> Bounds:
     """IoU of F with all occluded voxels set to empty, and to full.
 
-    These are the two curves that the paper draws as bounds (section 4); either can be the higher
+    These are the two curves that the paper draws as bounds (section 4.1); either can be the higher
     one.
 
     Args:

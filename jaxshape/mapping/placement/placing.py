@@ -1,6 +1,6 @@
 """The object's box, found without hand work: where it stands, how it is turned, how large it is.
 
-The paper (section 4.3) is given the first pose by hand. Here the prior finds it: of many boxes
+The paper (section 4.2) is given the first pose by hand. Here the prior finds it: of many boxes
 around the measured points, the object's own is that in which the network explains them best. In a
 level world a box has seven numbers: its turn about the vertical and two opposite corners.
 
@@ -288,7 +288,7 @@ def place(
 ) -> Placement:
     """Find the box of an object in a level world, +y up, from what depth frames say of it.
 
-    The paper (section 4.3) is given the first pose by hand; here the box is found in which the
+    The paper (section 4.2) is given the first pose by hand; here the box is found in which the
     prior explains the points best.
 
     Args:

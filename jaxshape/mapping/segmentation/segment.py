@@ -1,4 +1,4 @@
-"""Segmentation of the object in a depth frame (paper, sections 3.1 and 4.3). [host]
+"""Segmentation of the object in a depth frame (paper, sections 3.1 and 4.2). [host]
 
 The paper thresholds depth by hand. Here the floor, the walls and table tops are taken out as
 planes; the rest falls apart into clusters where depth jumps; the cluster in the middle, or under a
@@ -99,7 +99,7 @@ def segment(
     prompt: Prompt = Prompt(),
     mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Segmentation:
-    """Find the pixels of one frame that measure the object (paper, sections 3.1 and 4.3). [host]
+    """Find the pixels of one frame that measure the object (paper, sections 3.1 and 4.2). [host]
 
     A given mask is taken as it is. Without one, floor, walls and table tops are removed from the
     pixels that the prompt allows, and the cluster under the click, or the one largest and nearest
