@@ -91,7 +91,7 @@ def cma_start(
 ) -> CmaState:
     """The distribution N(point, sigma0^2 I) before the first generation.
 
-    With `cma_ask` and `cma_tell` for an own loop, in JAX or around a simulator:
+    Use it with `cma_ask` and `cma_tell` in your own loop, in JAX or around a simulator:
 
     >>> import jax, jax.numpy as jnp, jaxshape as js
     >>> losses_of = jax.vmap(lambda x: jnp.sum((x - 3) ** 2))
@@ -106,8 +106,8 @@ def cma_start(
     Args:
         point: Centre of the distribution `[d]`.
         sigma0: Standard deviation of every coordinate, above 0.
-        population: Candidates per generation, 3 or more, that the stop criteria of `stopping.check`
-            reckon with; None for pycma's 4 + floor(3 ln d).
+        population: Candidates per generation, 3 or more, for the stop criteria of `stopping.check`;
+            None for pycma's 4 + floor(3 ln d).
         loss: Loss of the point where it is known; the point then counts as the best so far.
 
     Returns:

@@ -72,8 +72,8 @@ def refine(
     search has stopped is frozen and no longer decoded.
 
     Args:
-        keys: One random key for each object `[object]`, or one for all, which is split. Objects do
-            not influence each other, and find the same in any company.
+        keys: One random key for each object `[object]`, or one for all, which is split. The result
+            of an object does not depend on the others in its batch.
         prior: The shape prior.
         codes: First code of each object `[object d]`.
         targets: Target of each object, `residual.target(grids, first_logits)`: a pytree whose
