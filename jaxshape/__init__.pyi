@@ -1,3 +1,4 @@
+from .data.archives import MeshSource
 from .data.boxes import Box
 from .data.capture import Capture, capture, measure_frames
 from .data.chairs import random_chair
@@ -86,6 +87,7 @@ __all__ = [
     "Mapper",
     "MappingConfig",
     "Measurement",
+    "MeshSource",
     "Model",
     "PAPER",
     "Pinhole",
