@@ -113,7 +113,7 @@ def downsample_tiles(
 def gradient_of_tiles(
     fine: Float[Array, "b x y z fine"], coarse: Float[Array, "b _ _ _ coarse"]
 ) -> Float[Array, "36 3*coarse 8*fine"]:
-    """By the transformed kernel: the adjoint of `upsample_tiles` by its matrices."""
+    """Gradient by the transformed kernel: the adjoint of `upsample_tiles` by its matrices."""
     shape = (POINTS**2, 3 * coarse.shape[-1], 8 * fine.shape[-1])
     matrices = jnp.zeros(shape, jnp.float32)
     up = lambda matrices: upsample_tiles(coarse, matrices)  # noqa: E731
