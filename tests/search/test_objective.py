@@ -16,6 +16,8 @@ from jaxshape.search.objective import objective
 from jaxshape.search.residuals import BALANCED, Residual, Target, cross_entropy
 from jaxshape.search.run import refine
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 
 def losses_of(prior, codes, targets, **options):
     """Losses of all candidates of all objects."""
@@ -123,7 +125,7 @@ def test_slopes_of_the_network_are_right_in_64_bits(prior, dtype):
         return jax.jit(jax.value_and_grad(objective(prior, Target(*grids))))(code)
 
     loss, expected = slope(prior, jnp.float32(code))
-    with jax.experimental.enable_x64():
+    with jax.enable_x64(True):
         wide = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), dtype), prior)
         found_loss, found = slope(wide, jnp.asarray(code))
         assert found_loss.dtype == found.dtype == jnp.float64
