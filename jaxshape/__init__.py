@@ -21,6 +21,9 @@ Conventions, stated here once:
 - Occupied voxels are those that hold a piece of the SURFACE; the inside of a solid is free.
 - A boolean array is named for what True means: `occupied` is F, `occluded` is M.
 - `decode` gives logits; a voxel is occupied where they are positive. Losses are in nats per voxel.
+- `PAPER`, `BALANCED` and `SOFT` are residuals, the objectives of a search: Eq. 7 as printed, Eq. 7
+  with a third of the weight on measured free space, and the latter with voxels weighted by how sure
+  their measurement is (`help(js.Residual)`).
 - Leading axes `*batch` broadcast; `b` or `object` is one batch axis.
 
 Data moves one way, and so do imports:

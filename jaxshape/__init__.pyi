@@ -1,7 +1,15 @@
+from .data.archives import MeshSource
+from .data.boxes import Box
 from .data.capture import Capture, capture, measure_frames
 from .data.chairs import random_chair
-from .data.meshes import load, read_meshes
-from .data.sequences import Trajectory, open_sequence, read_trajectory, write_trajectory
+from .data.meshes import Model, Skipped, load, read_meshes
+from .data.sequences import (
+    Pinhole,
+    Trajectory,
+    open_sequence,
+    read_trajectory,
+    write_trajectory,
+)
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.evidence import Grids, binary
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
@@ -10,7 +18,7 @@ from .geometry.overlap import iou
 from .mapping.config import MappingConfig, TrackingConfig
 from .mapping.map.mapper import Mapper, build_mapper
 from .mapping.map.recording import Progress, follow, trajectory
-from .mapping.placement.finding import find_start
+from .mapping.placement.finding import Start, find_start
 from .mapping.placement.placing import Placement, PlacementConfig, place
 from .mapping.segmentation.segment import Prompt, Segmentation, segment
 from .mapping.tracking.keyframes import PreparedFrame
@@ -18,7 +26,7 @@ from .model.config import Architecture
 from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
 from .model.weights import load_prior, save_prior
 from .report.page import write_report
-from .results.metrics import bounds, chamfer_l1, f_score, shape_scores
+from .results.metrics import Bounds, ShapeScores, bounds, chamfer_l1, f_score, shape_scores
 from .results.surface import surface, write_mesh
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
 from .search.config import RefineConfig
@@ -66,6 +74,8 @@ from .search.stopping import Tolerances
 __all__ = [
     "Architecture",
     "BALANCED",
+    "Bounds",
+    "Box",
     "Candidate",
     "Capture",
     "CmaState",
@@ -77,7 +87,10 @@ __all__ = [
     "Mapper",
     "MappingConfig",
     "Measurement",
+    "MeshSource",
+    "Model",
     "PAPER",
+    "Pinhole",
     "Placement",
     "PlacementConfig",
     "Prepared",
@@ -93,6 +106,9 @@ __all__ = [
     "Segmentation",
     "ShapeModel",
     "ShapePrior",
+    "ShapeScores",
+    "Skipped",
+    "Start",
     "StopReason",
     "Target",
     "Tolerances",

@@ -15,9 +15,9 @@ class BadSetting(ValueError):
     """A setting has a wrong value.
 
     Attributes:
-        name: The field.
-        value: What it was given.
-        wanted: What it takes, as the end of a sentence that begins with "give".
+        name: Name of the field.
+        value: The refused value.
+        wanted: What the field takes, as the end of a sentence that begins with "give".
     """
 
     def __init__(self, name: str, value: Any, wanted: str) -> None:
@@ -29,9 +29,9 @@ def refuse(name: str, value: Any, wanted: str) -> NoReturn:
     """Say that a setting has a wrong value.
 
     Args:
-        name: The field.
-        value: What it was given.
-        wanted: What it takes, as the end of a sentence that begins with "give".
+        name: Name of the field.
+        value: The refused value.
+        wanted: What the field takes, as the end of a sentence that begins with "give".
 
     Raises:
         BadSetting: Always.
@@ -43,9 +43,9 @@ def one_of(name: str, value: Any, choices: Iterable[Any]) -> None:
     """Refuse a value that is none of the choices.
 
     Args:
-        name: The field.
-        value: What it was given.
-        choices: All that it takes.
+        name: Name of the field.
+        value: The value to check.
+        choices: All values that the field takes.
     """
     choices = tuple(choices)
     if value not in choices:
@@ -56,8 +56,8 @@ def whole(name: str, value: Any, least: int) -> None:
     """Refuse what is not a whole number from `least` up.
 
     Args:
-        name: The field.
-        value: What it was given.
+        name: Name of the field.
+        value: The value to check.
         least: The smallest number it takes.
     """
     if not (_is_number(value) and isinstance(value, Integral) and int(value) >= least):
@@ -68,8 +68,8 @@ def positive(name: str, value: Any, unit: str = "") -> None:
     """Refuse what is not a finite number above 0.
 
     Args:
-        name: The field.
-        value: What it was given.
+        name: Name of the field.
+        value: The value to check.
         unit: Its unit in the plural, as "metres"; empty where it has none.
     """
     if not (_is_number(value) and 0 < value < math.inf):
@@ -80,8 +80,8 @@ def at_least(name: str, value: Any, least: int | float) -> None:
     """Refuse what is not a finite number from `least` up.
 
     Args:
-        name: The field.
-        value: What it was given.
+        name: Name of the field.
+        value: The value to check.
         least: The smallest number it takes.
     """
     if not (_is_number(value) and least <= value < math.inf):
@@ -92,8 +92,8 @@ def within(name: str, value: Any, low: int | float, high: int | float) -> None:
     """Refuse what is not a number between two others, or one of them.
 
     Args:
-        name: The field.
-        value: What it was given.
+        name: Name of the field.
+        value: The value to check.
         low: The smallest number it takes.
         high: The largest number it takes.
     """

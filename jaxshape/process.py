@@ -39,9 +39,14 @@ def join_processes(
 ) -> None:
     """Make this process one of several that compute together; to be called before JAX computes.
 
-    `coordinator` is the address, `host:port`, at which process 0 listens; `process` is this one's
-    number among the `processes`. Where none is given, JAX learns all three from Slurm, Open MPI or
-    another cluster that it knows. `ValueError` where only some are given, or no cluster is found.
+    Args:
+        coordinator: Address `host:port` at which process 0 listens; None to learn it from a cluster
+            that JAX knows, such as Slurm or Open MPI.
+        processes: Number of processes; None as for the coordinator.
+        process: Number of this process, from 0; None as for the coordinator.
+
+    Raises:
+        ValueError: Only some are given, or no cluster is found.
     """
     given = {"coordinator": coordinator, "processes": processes, "process": process}
     missing = [name for name, value in given.items() if value is None]
@@ -64,10 +69,10 @@ def join_processes(
 
 
 class Processor(NamedTuple):
-    """The machine's processor, as the system tells of it.
+    """The processor of the machine, as the system describes it.
 
     Attributes:
-        name: For people.
+        name: Name of the processor, for people.
         features: The instructions that it knows, such as `avx2`, `avx512f` and `amx_bf16`; empty
             where the system does not tell.
     """

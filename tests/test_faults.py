@@ -24,6 +24,7 @@ from orbit_recording import (
 from jaxshape.cli import recording as command
 from jaxshape.data.sequences import read_trajectory
 from jaxshape.geometry import fusion
+from jaxshape.mapping.map import mapper as module
 from jaxshape.mapping.map import recording
 from jaxshape.mapping.map.recording import trajectory
 from jaxshape.report import page, panels

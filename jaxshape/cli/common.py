@@ -1,4 +1,4 @@
-"""What all commands share: the console, progress, and the refusal of bad input."""
+"""Parts that all commands share: the console, progress, and the refusal of bad input."""
 
 from typing import Any
 

@@ -22,11 +22,11 @@ class Inspect:
     """Folder of the recording: 7-Scenes, TUM RGB-D, Redwood, Open3D, or rgb/ depth/ masks/ with
     cam_K.txt."""
     depth_scale: float | None = None
-    """Depth units in a metre; by default those of the layout."""
+    """Depth units in a metre, above 0; those of the layout by default."""
     layout: Literal["7-scenes", "tum", "redwood", "bundlesdf", "open3d"] | None = None
-    """How the files lie; by default found out."""
+    """Layout of the files; detected by default."""
     json: bool = False
-    """Answer with one JSON object instead of a table."""
+    """Print one JSON object instead of a table."""
 
     def run(self) -> None:
         from jaxshape.data.sequences import open_sequence

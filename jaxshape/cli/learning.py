@@ -40,7 +40,7 @@ class BuildDataset:
     """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural chairs."""
     config: tyro.conf.OmitArgPrefixes[DatasetConfig] = DatasetConfig()
     workers: int = PROCESSORS
-    """Processes."""
+    """Processes that work at the same time, 1 or more."""
 
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
@@ -105,20 +105,20 @@ class Train:
     """Mesh archive or folder (ShapeNet, ModelNet, ...) to train on, instead of --dataset."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
     name: str = "weights"
-    """Of the weights file and its card; with --meshes, the kind of object."""
+    """Name of the weights file and of its card; with --meshes, the kind of object."""
     output: Path | None = None
     """Folder for NAME.safetensors, NAME.md, card.json, metrics.jsonl and the checkpoint, and with
     --meshes for the dataset and evaluation.json; out/NAME where not given."""
     start: Path | None = None
     """Weights to begin with, of the same sizes, instead of random ones."""
     licence: str = "not stated"
-    """Of the weights, for their card; what is right depends on the meshes, too."""
+    """Licence of the weights, for their card; the licence of the meshes may restrict it."""
     model: Literal["autoencoder", "pca"] = "autoencoder"
     """The paper's network, or principal components of the complete surfaces: a cheap rival, made in
     seconds, of which --code numbers and --seed are the only settings."""
     preset: Preset = "default"
-    """What the options below are unless given: what we found best, or the paper's own; train
-    --preset paper --help shows these."""
+    """Defaults of the options below: the best that we found, or the paper's own, which
+    `jaxshape train --preset paper --help` shows."""
     config: tyro.conf.OmitArgPrefixes[TrainConfig] = TrainConfig()
     machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
 

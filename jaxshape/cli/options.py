@@ -15,12 +15,12 @@ from jaxshape.data.config import Axis, check_axes
 
 @dataclass(frozen=True, kw_only=True)
 class Axes:
-    """How the files of --meshes are turned."""
+    """Orientation of the files of --meshes."""
 
     up: Axis = "y"
     """Axis of the meshes that points up."""
     front: Axis = "z"
-    """Axis of the meshes along which the object's front looks."""
+    """Axis of the meshes along which the object's front looks; perpendicular to --up."""
 
     def __post_init__(self) -> None:
         check_axes(self.up, self.front)
@@ -43,9 +43,9 @@ class Machines:
     coordinator: str | None = None
     """Join processes started by hand: HOST:PORT of the first of them, the same for all."""
     processes: int | None = None
-    """With --coordinator: how many there are."""
+    """With --coordinator: number of processes."""
     process: int | None = None
-    """With --coordinator: which of them this one is, from 0."""
+    """With --coordinator: number of this process, from 0."""
 
     def join(self) -> None:
         """Join the others, if there are any; to be called before JAX computes."""

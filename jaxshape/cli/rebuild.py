@@ -19,7 +19,7 @@ VARIANTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Rebuild:
-    """What the commands that rebuild one object have in common."""
+    """Options of all commands that rebuild one object."""
 
     method: Annotated[
         str,
@@ -34,7 +34,7 @@ class Rebuild:
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
     seed: int = 0
-    """Of all random numbers."""
+    """Seed of all random numbers, 0 or more."""
 
     def prepare(self) -> tuple[Any, Any, RefineConfig]:
         """The prior, the search and its settings, so that bad options are refused before work."""
@@ -45,12 +45,12 @@ class Rebuild:
         return prior, refiner_for(self.method, prior, self.search), self.search
 
     def settings(self) -> dict[str, Any]:
-        """What result.json says of the search."""
+        """Settings of the search for result.json."""
         return {"method": self.method, "seed": self.seed, "search": asdict(self.search)}
 
 
 def report_objective(result: dict[str, Any]) -> None:
-    """Say what the search was worth."""
+    """Print the objective before and after the search."""
     stopped = f", stopped by {result['stop']}" if result["stop"] else ""
     print(
         f"objective: encoder {result['objective_encoder']:.4f}, "
@@ -68,7 +68,7 @@ class Demo(Rebuild):
     """
 
     frames: int = 6
-    """Depth frames along the orbit, 20 degrees apart."""
+    """Depth frames along the orbit, 20 degrees apart, 1 or more."""
     output: Path = Path("out/demo")
     """Folder for mesh.glb, mesh.ply, grid.npz, trace.npz, result.json, overview.png and
     report.html."""

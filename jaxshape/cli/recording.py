@@ -38,16 +38,16 @@ class Reconstruct(Rebuild):
     """Nearest and farthest depth of the object in the first frame, in metres."""
     box: Path | None = None
     """JSON file with the object's box: {"T_world_object": 4x4, "size": [x, y, z]}. The object
-    frame has +y up and its front along +z; the world is that of the poses or, without, of the
-    first camera."""
+    frame has +y up and its front along +z; the world is that of the poses or, without poses, the
+    frame of the first camera."""
     poses: Literal["auto", "given", "first", "none"] = "auto"
-    """Which given poses to use: all (auto: where there are any), the first alone, or none."""
+    """Given poses to use: all (auto: where there are any), the first alone, or none."""
     first: int = 0
     """Number of the first frame, from 0."""
     every: int = 1
-    """Use every n-th frame."""
+    """Use every n-th frame, n being 1 or more."""
     depth_scale: float | None = None
-    """Depth units in a metre, where they are not those of the layout."""
+    """Depth units in a metre, above 0; those of the layout by default."""
     tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
     mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
     fresh: bool = False
@@ -150,7 +150,7 @@ class Reconstruct(Rebuild):
         remove_state(self.output)
 
     def _use_poses(self, sequence: Any) -> bool:
-        """Whether all given poses are used; refuses what cannot be."""
+        """Whether all given poses are used; refuses options that contradict the recording."""
         from jaxshape.data.sequences import poses_look_inverted
 
         if self.poses in ("given", "first"):
@@ -168,7 +168,7 @@ class Reconstruct(Rebuild):
         return True
 
     def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
-        """Draw what was found and say it."""
+        """Draw the pictures and the report, and print a summary."""
         from jaxshape.report.page import write_report
         from jaxshape.report.panels import write_overview
         from jaxshape.results.progress import observation_of

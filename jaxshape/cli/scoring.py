@@ -32,20 +32,20 @@ class Evaluate:
     """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
     chairs: int = 0
-    """Procedural test chairs to use instead of --meshes."""
+    """Number of procedural test chairs to use instead of --meshes."""
     frames: str = "1,4,8,18"
-    """Numbers of frames to fuse, with commas: the first k of an orbit in steps of 20 degrees."""
+    """Numbers of frames to fuse, separated by commas: the first k of an orbit, 20 degrees apart."""
     methods: str = "encoder,gradient,cma"
-    """Methods to score, with commas; those of `jaxshape reconstruct --method`."""
+    """Methods to score, separated by commas; those of `jaxshape reconstruct --method`."""
     noise: bool = False
     """Add the faults of a real depth sensor."""
     ceiling: bool = False
-    """Score too what the weights could draw at best: the code fitted to the whole truth."""
+    """Score the best shape of the weights, too: the code fitted to the whole truth."""
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
     seed: int = 0
-    """Of noise, surface samples and searches."""
+    """Seed of noise, surface samples and searches, 0 or more."""
 
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
@@ -186,7 +186,7 @@ class Plot:
     results: Positional[tuple[Path, ...]]
     """Folders made by `jaxshape reconstruct` or `jaxshape demo`; several are compared."""
     output: Path | None = None
-    """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder where not given."""
+    """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder by default."""
 
     def run(self) -> None:
         from jaxshape.report.plots import compare_searches, plot_search

@@ -20,9 +20,9 @@ class ViewResult:
     result: Positional[Path]
     """Folder made by `jaxshape reconstruct` or `jaxshape demo`, finished or not."""
     port: int = 8080
-    """Where to serve; the next free one if it is taken."""
+    """Port to serve at, 1 to 65535; the next free one if it is taken."""
     host: str = "127.0.0.1"
-    """Address to listen at; unless it is this one, others on the network see the result, too."""
+    """Address to listen at; with any other than this one, others on the network see the result."""
 
     def run(self) -> None:
         require(

@@ -1,4 +1,4 @@
-"""Where meshes lie: folders, zip archives and furniture catalogues, listed without opening a mesh.
+"""Meshes in folders, zip archives and furniture catalogues, listed without opening a mesh. [host]
 
 Everything is read in memory, through `read_bytes`: nothing is ever unpacked to disk, so a member
 called `../../evil.obj` is only a name, and a member that inflates without end is cut off.
@@ -30,17 +30,21 @@ _CATALOGUE_FIELDS = (
 
 
 class MeshSource(NamedTuple):
-    """One mesh that can be loaded: small, picklable, with no geometry in it."""
+    """One mesh that can be loaded: small, picklable, without geometry.
+
+    Attributes:
+        name: Path below the listed root without suffixes, with `/` between folders and no `..`;
+            where two would be equal, each keeps its suffixes. No two of a listing are equal.
+        path: The file on disk: a mesh, or the archive that holds it.
+        member: Name of the member inside the archive; None for a file of its own.
+        metadata: Entries of a furniture catalogue for the mesh, under the catalogue's own field
+            names; else empty.
+    """
 
     name: str
-    """Path below the listed root without suffixes, with `/` between folders and no `..`; where
-    two would be equal, each keeps its suffixes. No two of a listing are equal."""
     path: str
-    """The file on disk: a mesh, or the archive that holds it."""
     member: str | None = None
-    """The member inside the archive."""
     metadata: dict[str, str] = {}  # noqa: RUF012 - never written to
-    """What a furniture catalogue says of it, under the catalogue's own field names."""
 
 
 class TooLarge(ValueError):
@@ -48,14 +52,18 @@ class TooLarge(ValueError):
 
 
 def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
-    """List every mesh at `path`, in the order of their names, without loading any.
+    """List every mesh at a path, in the order of their names, without loading any.
 
-    `path` is a mesh, an archive (`.zip`, or Sweet Home 3D's `.sh3f`), or a folder searched
-    recursively for both, as ShapeNet and ModelNet trees are; symbolic links to folders are not
-    followed, and hidden files are left out. An archive that cannot be opened is listed under its
-    own name, so that loading it reports why.
+    Folders are searched recursively for meshes and archives, as ShapeNet and ModelNet trees are;
+    symbolic links to folders are not followed, and hidden files are left out. An archive that
+    cannot be opened is listed under its own name, so that loading it reports why.
 
-    Raises `FileNotFoundError` where there is nothing at `path`, `ValueError` where no mesh is.
+    Args:
+        path: A mesh, an archive (`.zip`, or Sweet Home 3D's `.sh3f`), or a folder of both.
+
+    Raises:
+        FileNotFoundError: There is nothing at the path.
+        ValueError: The path holds no mesh.
     """
     root = Path(path)
     if not root.exists():
@@ -155,10 +163,16 @@ def _catalogue(archive: zipfile.ZipFile) -> dict[str, dict[str, str]]:
 
 
 def read_bytes(source: MeshSource, beside: str | None = None) -> bytes:
-    """Return the content of a mesh's file, or of the file at `beside`, relative to its folder.
+    """The content of the file of a mesh, or of a file beside it.
 
-    Raises `ValueError` where `beside` leaves the folder or the archive, `TooLarge` above
-    `MAX_BYTES`, and what `open` and `zipfile` raise.
+    Args:
+        source: The mesh.
+        beside: Path of the other file, relative to the folder of the mesh; None for the mesh
+            itself.
+
+    Raises:
+        ValueError: `beside` leaves the folder or the archive.
+        TooLarge: The file is larger than `MAX_BYTES`.
     """
     path = Path(source.path)
     if source.member is None and path.suffix.lower() in ARCHIVE_SUFFIXES:

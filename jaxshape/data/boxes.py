@@ -12,18 +12,28 @@ from jaxshape.data.sequences import SequenceError, check_rigid
 
 
 class Box(NamedTuple):
-    """An oriented box around the object, less some boxes that hold other things."""
+    """An oriented box around the object, less some boxes that hold other things.
+
+    Attributes:
+        T_world_object: Pose of the object frame `[4 4]`: origin at the centre of the box, +y up,
+            front along +z, in metres.
+        size: Extents along the axes of the object `[3]`, in metres, above 0.
+        exclude: Lowest and highest corners, in the object frame, of boxes whose points are not the
+            object `[e 2 3]`; empty for none.
+    """
 
     T_world_object: Float[np.ndarray, "4 4"]
-    """Object frame: origin at the centre of the box, +y up, front along +z, metres."""
     size: Float[np.ndarray, " 3"]
-    """Extent along the axes of the object, metres."""
     exclude: Float[np.ndarray, "e 2 3"] = np.zeros((0, 2, 3))
-    """Lowest and highest corners, in the object frame, of boxes whose points are not the object."""
 
 
 def points_in_box(points: Float[np.ndarray, "*batch 3"], box: Box) -> Bool[np.ndarray, "*batch"]:
-    """Whether points, in world coordinates, lie in the box and in none of those it excludes."""
+    """Whether points lie in the box and in none of those it excludes.
+
+    Args:
+        points: Points in the world `[*batch 3]`, in metres.
+        box: The box.
+    """
     R, t = box.T_world_object[:3, :3], box.T_world_object[:3, 3]
     p = (points - t) @ R  # the inverse of a rotation is its transpose, applied to rows
     inside = _within(p, -box.size / 2, box.size / 2)
@@ -44,11 +54,15 @@ def read_box(path: str | Path) -> Box:
     The file holds `{"T_world_object": 4x4, "size": [x, y, z]}` and may hold
     `"exclude": [{"min": [x, y, z], "max": [x, y, z]}, ...]`, as the fields of `Box`. A file with
     `world_to_level` (4x4, to a frame with z up) and `chair_box_level` (`X`, `Y` and `h`, each
-    lowest and highest) is read as a box whose front looks along the level X, for such a file
-    cannot say where the front is; what its `exclude_level` names, comparisons of X, Y or h with
-    numbers joined by `and`, is left out.
+    lowest and highest) is read as a box whose front looks along the level X, since such a file does
+    not name the front; the regions that its `exclude_level` describes, comparisons of X, Y or h
+    with numbers joined by `and`, are excluded.
 
-    Raises `SequenceError` for anything else.
+    Args:
+        path: The JSON file.
+
+    Raises:
+        SequenceError: The file cannot be read, or is none of these.
     """
     try:
         content = json.loads(Path(path).read_text())

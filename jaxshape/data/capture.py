@@ -21,15 +21,23 @@ SURFACE_SAMPLES = 50_000
 
 
 class Capture(NamedTuple):
-    """An object, and depth frames of it."""
+    """Depth frames of an object from known poses, and its true surface.
+
+    Attributes:
+        depth: Depth images `[views h w]`, in metres; 0 where nothing is known, infinite where the
+            ray met nothing.
+        intrinsics: The camera of all frames.
+        T_object_camera: Pose of each frame in the object frame `[views]`.
+        frame: Voxel frame of the object's grids.
+        surface: True in voxels that hold a point of the CAD model's surface `[x y z]`: the ground
+            truth **Y**.
+    """
 
     depth: Float[Array | np.ndarray, "views h w"]
-    """Metres; 0 where nothing is known, infinite where the ray met nothing."""
     intrinsics: Intrinsics
     T_object_camera: jaxlie.SE3
     frame: GridFrame
     surface: Bool[Array | np.ndarray, "x y z"]
-    """Voxels that hold a point of the CAD model's surface: the ground truth **Y**."""
 
 
 def capture(
@@ -41,10 +49,19 @@ def capture(
     image_size: int = render.IMAGE_SIZE,
     resolution: int = grid.RESOLUTION,
 ) -> Capture:
-    """Look at a canonical mesh from some poses, and find its surface voxels.
+    """Look at a mesh from some poses, and find its surface voxels (paper, section 2.3). [host]
 
     The ground truth comes straight from points on the CAD model, not through the depth frames, so
-    that it is complete (paper, section 2.3).
+    that it is complete.
+
+    Args:
+        mesh: A mesh in the canonical object frame: +y up, front along +z, box centred at the
+            origin, in metres.
+        T_object_camera: Poses of the camera `[views]`.
+        noise: Whether to add the faults of a structured-light sensor.
+        seed: Seed of the noise and of the surface samples, 0 or more.
+        image_size: Pixels along each side of the square images.
+        resolution: Voxels along each axis of the object's grids.
     """
     intrinsics = render.fit_intrinsics(mesh, T_object_camera, image_size)
     depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, image_size)
@@ -56,7 +73,7 @@ def capture(
 
 
 def camera_distance(mesh: trimesh.Trimesh) -> float:
-    """How far from the object's centre the virtual camera stands, in metres."""
+    """Distance of the virtual camera from the object's centre, in metres."""
     return render.DISTANCE * float(mesh.scale)
 
 
@@ -70,7 +87,16 @@ def discretize(
 
 @jax.jit
 def measure_frames(captured: Capture) -> Measurement:
-    """One measurement per frame; every pixel that hit something shows the object."""
+    """Measure each frame of a capture on its own; every pixel that hit something shows the object.
+
+    Compiled by `jax.jit`.
+
+    Args:
+        captured: Depth frames of an object, from `capture`.
+
+    Returns:
+        One measurement for each frame `[views x y z]`; `merge_all` merges them.
+    """
     depth = jnp.asarray(captured.depth)
     measure = partial(
         fusion.measure,

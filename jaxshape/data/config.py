@@ -1,4 +1,7 @@
-"""Settings of a dataset and of the inputs drawn from it; free of JAX, for the command line."""
+"""Settings of a dataset and of the inputs drawn from it.
+
+Nothing here imports JAX, so that the command line answers at once.
+"""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -9,14 +12,14 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 def check_axes(up: str, front: str) -> None:
-    """Refuse axes that say nothing of how an object is turned.
+    """Refuse axes that do not describe the orientation of an object.
 
     Args:
         up: Axis that points up, as "y" or "-z".
         front: Axis along which the object's front looks.
 
     Raises:
-        ValueError: Where one of them is no axis, or both lie on one line.
+        ValueError: One of them is no axis, or both lie on one line.
     """
     checks.one_of("up", up, get_args(Axis))
     checks.one_of("front", front, get_args(Axis))
@@ -28,20 +31,26 @@ def check_axes(up: str, front: str) -> None:
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """What, with the objects themselves, decides every byte of a dataset."""
+    """Settings that decide, with the objects themselves, every byte of a dataset.
+
+    Attributes:
+        views: Random views of each object, 1 or more (paper: 18).
+        noisy: Share of the objects whose depth images get the faults of a real sensor, from 0 to 1.
+        up: Axis of the mesh files that points up.
+        front: Axis of the mesh files along which the object's front looks.
+        resolution: Voxels along each axis of the grids: 8, 16, 32, 64 or 128 (paper: 32).
+        seed: Seed of views, noise and surface samples, 0 or more.
+
+    Raises:
+        ValueError: A setting is outside its range.
+    """
 
     views: int = 18
-    """Random views of each object (paper: 18)."""
     noisy: float = 0.5
-    """Share of the objects whose depth images get the faults of a real sensor."""
     up: Axis = "y"
-    """Axis of the mesh files that points up."""
     front: Axis = "z"
-    """Axis of the mesh files along which the object's front looks."""
     resolution: int = 32
-    """Voxels along each axis of the grids (paper: 32)."""
     seed: int = 0
-    """Of views, noise and surface samples."""
 
     def __post_init__(self) -> None:
         checks.one_of("resolution", self.resolution, (8, 16, 32, 64, 128))
@@ -53,22 +62,31 @@ class DatasetConfig:
 
 @dataclass(frozen=True)
 class InputConfig:
-    """What a training input goes through, so that it looks like those of a reconstruction."""
+    """How training inputs are changed, so that they look like those of a reconstruction.
+
+    Attributes:
+        max_views: Inputs fuse 1 to this many random views, 1 or more (paper: 1).
+        complete: Share of the inputs that are the complete surface itself, from 0 to 1.
+        mirror: Exchange left and right in half of the pairs.
+        scale: Shrink each axis by up to this share, from 0 to below 1, as a box that is a little
+            too large would.
+        pose_error: Share of the views that lie a voxel off along each axis, from 0 to 1.
+        missing: Share of the views that lack a region, as where a sensor returns nothing, from 0 to
+            1.
+        segmentation: Share of the views whose mask is wrong, from 0 to 1: it cuts a piece off, or
+            takes in some background.
+
+    Raises:
+        ValueError: A setting is outside its range.
+    """
 
     max_views: int = 18
-    """Inputs fuse 1 to this many random views (paper: 1)."""
     complete: float = 0.1
-    """Share of the inputs that are the complete surface itself."""
     mirror: bool = True
-    """Exchange left and right in half of the pairs."""
     scale: float = 0.0
-    """Shrink each axis by up to this share, as a box that is a little too large would."""
     pose_error: float = 0.05
-    """Share of the views that lie a voxel off along each axis."""
     missing: float = 0.1
-    """Share of the views that lack a region, as where a sensor returns nothing."""
     segmentation: float = 0.02
-    """Share of the views whose mask is wrong: it cuts a piece off, or takes in some background."""
 
     def __post_init__(self) -> None:
         checks.whole("max_views", self.max_views, 1)

@@ -38,7 +38,7 @@ TEST_SEEDS = 1_000_000
 """Procedural chairs from this seed on are for tests; training uses smaller ones."""
 
 Object = int | MeshSource
-"""What can be built into a dataset: the seed of a procedural chair, or a mesh file."""
+"""An object of a dataset: the seed of a procedural chair, or a mesh file."""
 
 
 class DatasetError(ValueError):
@@ -46,7 +46,13 @@ class DatasetError(ValueError):
 
 
 class BuildProgress(NamedTuple):
-    """How much of a build is done."""
+    """Progress of a build.
+
+    Attributes:
+        objects: Objects that are done, skipped ones included.
+        total: Objects in all.
+        skipped: Objects that could not be used.
+    """
 
     objects: int
     total: int
@@ -100,7 +106,7 @@ def _occupied_by_frame(captured: Capture) -> Bool[Array, "views x y z"]:
 
 
 def pack(grids: Bool[np.ndarray, "*batch x y z"]) -> UInt8[np.ndarray, "*batch bytes"]:
-    """Eight voxels a byte: 4 KiB for a grid."""
+    """Pack grids with eight voxels in a byte: 4 KiB for a grid of 32^3."""
     return np.packbits(grids.reshape(*grids.shape[:-3], -1), axis=-1)
 
 
@@ -120,9 +126,19 @@ def build_dataset(
     *,
     workers: int | None = None,
 ) -> Iterator[BuildProgress]:
-    """Write the shards that are missing, in parallel processes, yielding progress after each.
+    """Write the missing shards of a dataset in parallel processes.
 
-    Raises `DatasetError` when the folder holds a dataset of other objects or settings.
+    Args:
+        folder: Folder of the dataset; made if missing.
+        objects: Seeds of procedural chairs, or meshes.
+        config: Settings of the dataset.
+        workers: Processes, 1 or more; None for one for each CPU core.
+
+    Yields:
+        The progress, at first and after each shard.
+
+    Raises:
+        DatasetError: The folder holds a dataset of other objects or settings.
     """
     folder = Path(folder)
     _claim(folder, objects, config)
@@ -202,16 +218,22 @@ def _read_names(folder: Path, number: int) -> tuple[list[str], list[Skipped]]:
 
 
 class Dataset(NamedTuple):
-    """Objects of a dataset folder, left on disk until they are asked for."""
+    """Objects of a dataset folder, left on disk until they are asked for.
+
+    Attributes:
+        names: Names of the objects.
+        shards: Memory-mapped shards `[object view bytes]`; entry 0 of the second axis is the
+            complete surface.
+        row: Shard, and place in it, of each object.
+    """
 
     names: list[str]
     shards: list[UInt8[np.ndarray, "object view bytes"]]
-    """Memory-mapped; entry 0 of the second axis is the complete surface."""
     row: list[tuple[int, int]]
-    """Shard, and place in it, of each object."""
 
     @property
     def views(self) -> int:
+        """Views of each object."""
         return self.shards[0].shape[1] - 1
 
     @property
@@ -233,7 +255,14 @@ def surfaces(dataset: Dataset, limit: int = 4096) -> Bool[np.ndarray, "n x y z"]
 
 
 def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
-    """Open a finished dataset; raises `DatasetError` where there is none, or a part is missing."""
+    """Open a finished dataset.
+
+    Args:
+        folder: Folder of the dataset.
+
+    Raises:
+        DatasetError: There is no dataset, or a part of it is missing.
+    """
     folder = Path(folder)
     if not (folder / "dataset.json").exists():
         raise DatasetError(f"There is no dataset in {str(folder)!r}; make one: jaxshape dataset.")

@@ -15,7 +15,10 @@ def draw_pair(
 ) -> tuple[Grid, Grid]:
     """The measurement and the complete surface of one training pair.
 
-    `packed` holds an object's surface, then its views, as `Dataset.packed` gives them.
+    Args:
+        packed: An object's surface, then its views, as `Dataset.packed` gives them.
+        config: How the input is drawn.
+        rng: Random generator of the draws.
     """
     surface, views = unpack(packed[0]), packed[1:]
     if rng.random() < config.complete:
@@ -34,7 +37,7 @@ def draw_pair(
 
 
 def faulty(view: Grid, config: InputConfig, rng: np.random.Generator) -> Grid:
-    """One view with what goes wrong in real ones, each fault in its share of the views."""
+    """One view with the faults of real ones, each in its share of the views."""
     if rng.random() < config.segmentation:
         view = _cut(view, rng) if rng.random() < 0.5 else _leaked(view, rng)
     if rng.random() < config.missing:
@@ -45,7 +48,7 @@ def faulty(view: Grid, config: InputConfig, rng: np.random.Generator) -> Grid:
 
 
 def _cut(view: Grid, rng: np.random.Generator) -> Grid:
-    """Without up to a quarter of the grid at one of its six sides."""
+    """The view without up to a quarter of the grid at one of its six sides."""
     kept = view.copy()
     inwards = np.moveaxis(kept, rng.integers(3), 0)[:: 1 if rng.random() < 0.5 else -1]
     inwards[: rng.integers(1, len(view) // 4 + 1)] = False
@@ -53,7 +56,7 @@ def _cut(view: Grid, rng: np.random.Generator) -> Grid:
 
 
 def _leaked(view: Grid, rng: np.random.Generator) -> Grid:
-    """With a patch of floor or wall: part of one of the grid's sides."""
+    """The view with a patch of floor or wall: part of one of the sides of the grid."""
     n = len(view)
     low = rng.integers(0, n, 3)
     high = low + rng.integers(n // 8, n // 2, 3)
@@ -66,7 +69,7 @@ def _leaked(view: Grid, rng: np.random.Generator) -> Grid:
 
 
 def _holed(view: Grid, rng: np.random.Generator) -> Grid:
-    """Without what lies in a ball around one of its voxels."""
+    """The view without the voxels in a ball around one of them."""
     voxels = voxels_of(view)
     if len(voxels) == 0:
         return view

@@ -3,7 +3,7 @@
     for model in read_meshes("chairs/"):       # Model or Skipped, in the order of their names
         ...
 
-`list_meshes` finds them without opening any, `load` opens one: share those out over processes.
+`list_meshes` finds them without opening any, `load` opens one, so that processes can share them.
 """
 
 import io
@@ -33,24 +33,34 @@ FLAT = 1e-6
 
 
 class Model(NamedTuple):
-    """A CAD model in the canonical object frame."""
+    """A CAD model in the canonical object frame.
+
+    Attributes:
+        name: Stable identifier: the path below the root that was read, without suffix.
+        mesh: Triangles only, +y up, front along +z, bounding box centred at the origin, in the
+            units of the file (metres where the file is in metres, as glTF is, or where a catalogue
+            gives sizes).
+        metadata: Entries of a furniture catalogue: name, creator, license, and so on; else empty.
+    """
 
     name: str
-    """Stable identifier: the path below the root that was read, without suffix."""
     mesh: trimesh.Trimesh
-    """Triangles only, +y up, front along +z, bounding box centred at the origin, in the units of
-    the file (metres where the file is in metres, as glTF is, or where a catalogue gives sizes)."""
     metadata: dict[str, str]
-    """What a furniture catalogue says of it: name, creator, license, and so on; else empty."""
 
 
 class Skipped(NamedTuple):
-    """A mesh that cannot be used, and why."""
+    """A mesh that cannot be used, and why.
+
+    Attributes:
+        name: Identifier of the mesh, as in `Model`.
+        reason: One of `unreadable`, `too large`, `empty` (no vertices), `no faces` (none with an
+            area), `not finite`, `flat` (an axis with no extent), `nothing measured` (in an
+            evaluation).
+        detail: A sentence on what is wrong.
+    """
 
     name: str
     reason: str
-    """One of `unreadable`, `too large`, `empty` (no vertices), `no faces` (none with an area),
-    `not finite`, `flat` (an axis with no extent)."""
     detail: str
 
 
@@ -62,18 +72,42 @@ class _Unusable(ValueError):
 def read_meshes(
     path: str | os.PathLike[str], *, up: str = "y", front: str = "z"
 ) -> Iterator[Model | Skipped]:
-    """Load every mesh at `path` in turn; see `list_meshes` for what is found, and its errors."""
+    """Load every mesh at a path in turn, in the order of their names. [host]
+
+    Args:
+        path: A mesh, an archive (`.zip`, or Sweet Home 3D's `.sh3f`), or a folder of both, searched
+            recursively.
+        up: Axis of the files that points up: `x`, `y`, `z`, or one of these with a minus.
+        front: Axis of the files along which the object's front looks, perpendicular to `up`.
+
+    Returns:
+        An iterator over the meshes: a `Model`, or `Skipped` where one cannot be used.
+
+    Raises:
+        FileNotFoundError: There is nothing at the path.
+        ValueError: The path holds no mesh, or the axes are not perpendicular axes.
+    """
     sources = list_meshes(path)
     axes_to_canonical(up, front)  # a wrong axis is reported once, not for every mesh
     return (load(source, up=up, front=front) for source in sources)
 
 
 def load(source: MeshSource, *, up: str = "y", front: str = "z") -> Model | Skipped:
-    """Load one mesh, flattened and turned so that its `up` axis is +y and its `front` axis +z.
+    """Load one mesh, flattened and turned so that `up` becomes +y and `front` becomes +z. [host]
 
-    A file that is broken or holds nothing to use gives `Skipped`, never an exception. Materials
-    and pictures are dropped. Where a furniture catalogue describes the mesh, its rotation and
-    its size in centimetres are applied first, as Sweet Home 3D does.
+    Materials and pictures are dropped. Where a furniture catalogue describes the mesh, its rotation
+    and its size in centimetres are applied first, as Sweet Home 3D does.
+
+    Args:
+        source: The mesh, from `jaxshape.data.archives.list_meshes`.
+        up: Axis of the file that points up: `x`, `y`, `z`, or one of these with a minus.
+        front: Axis of the file along which the object's front looks, perpendicular to `up`.
+
+    Returns:
+        The mesh; `Skipped`, never an exception, for a file that is broken or holds nothing to use.
+
+    Raises:
+        ValueError: The axes are not perpendicular axes.
     """
     axes_to_canonical(up, front)
     try:
@@ -154,10 +188,16 @@ def _apply_catalogue(mesh: trimesh.Trimesh, metadata: dict[str, str]) -> None:
 
 
 def canonical(mesh: trimesh.Trimesh, *, up: str = "y", front: str = "z") -> trimesh.Trimesh:
-    """Turn a mesh so that `up` becomes +y and `front` +z, and centre its bounding box.
+    """Turn a mesh so that `up` becomes +y and `front` +z, and centre its bounding box; the scale is
+    kept.
 
-    Axes are `x`, `y`, `z`, or those with a minus. The scale is kept. Raises `ValueError` where
-    the two axes are not perpendicular or not axes.
+    Args:
+        mesh: The mesh.
+        up: Axis that points up: `x`, `y`, `z`, or one of these with a minus.
+        front: Axis along which the object's front looks.
+
+    Raises:
+        ValueError: The axes are not perpendicular axes.
     """
     vertices = np.asarray(mesh.vertices) @ axes_to_canonical(up, front).T
     turned = trimesh.Trimesh(vertices, mesh.faces, process=False)
@@ -174,10 +214,15 @@ def axes_to_canonical(up: str, front: str) -> Float[np.ndarray, "3 3"]:
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
-    """Sample `count` points on the surface, uniform in area, the same for the same seed.
+    """Sample points on the surface, uniform in area, the same for the same seed.
 
-    The area is cut into `count` equal strata with one point in each, so that every part with
-    at least two points' worth of area is hit, however thin.
+    The area is cut into equal strata with one point in each, so that every part with at least two
+    points' worth of area is hit, however thin.
+
+    Args:
+        mesh: The mesh.
+        count: Number of points.
+        seed: Seed of the points.
     """
     random = np.random.default_rng(seed)
     area = np.cumsum(trimesh.triangles.area(mesh.triangles))

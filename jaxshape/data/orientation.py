@@ -1,4 +1,4 @@
-"""Does a seat stand on its feet? A warning for meshes read with the wrong up axis.
+"""Whether a seat stands on its feet: a warning for meshes read with the wrong up axis.
 
 Each of the six directions along the axes is scored as the seat's up direction: a seat stands on
 a few points far apart, has one large level surface near half height, and is not the same when
@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 DIRECTIONS = ("y", "-y", "z", "-z", "x", "-x")
 
 MARGIN = 0.35
-"""How much better than +y another direction must score to be believed: of 78 upright real seats,
+"""Margin by which another direction must score better than +y: of 78 upright real seats,
 the one that came closest to a false alarm reached 0.28."""
 
 CELLS = 16

@@ -1,4 +1,4 @@
-"""Which meshes of a collection are kept out of training. [host]"""
+"""The meshes of a collection that are kept out of training. [host]"""
 
 import hashlib
 from collections.abc import Sequence
@@ -6,15 +6,23 @@ from collections.abc import Sequence
 from jaxshape.data.archives import MeshSource
 
 SHARE = 0.1
-"""Of the meshes that are held out."""
+"""Share of the meshes that are held out."""
 
 
 def hold_out(sources: Sequence[MeshSource]) -> tuple[list[MeshSource], list[MeshSource]]:
-    """The meshes to train on, and about every tenth, but at least one, held out to be scored.
+    """Divide meshes into those to train on, and about every tenth, but at least one, held out.
 
-    Which ones depends on their names alone: a mesh stays on its side when others join the
-    collection, so that training can go on from earlier weights and never meets one it is scored on.
-    `ValueError` where there are fewer than two.
+    The side depends on the name alone: a mesh stays on its side when others join the collection, so
+    that training can go on from earlier weights and never meets a mesh it is scored on.
+
+    Args:
+        sources: Meshes of the collection, two or more.
+
+    Returns:
+        The meshes to train on, and those held out.
+
+    Raises:
+        ValueError: There are fewer than two meshes.
     """
     if len(sources) < 2:
         raise ValueError(

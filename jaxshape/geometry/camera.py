@@ -14,7 +14,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 
 class Intrinsics(NamedTuple):
-    """Focal lengths and principal point of a pinhole camera, in pixels."""
+    """A pinhole camera; leading axes are batch axes.
+
+    Attributes:
+        fx: Focal length along x `[*batch]`, in pixels.
+        fy: Focal length along y `[*batch]`, in pixels.
+        cx: Column of the principal point `[*batch]`, in pixels; the centre of the first pixel is at
+            0.5.
+        cy: Row of the principal point `[*batch]`, in pixels; the centre of the first pixel is at
+            0.5.
+    """
 
     fx: Float[Array, "*batch"]
     fy: Float[Array, "*batch"]
@@ -23,17 +32,22 @@ class Intrinsics(NamedTuple):
 
 
 def intrinsics_for(field_of_view: float, image_size: int) -> Intrinsics:
-    """A square image of `image_size` pixels that sees `field_of_view` degrees."""
+    """The camera of a square image.
+
+    Args:
+        field_of_view: Angle between opposite sides, in degrees, between 0 and 180.
+        image_size: Pixels along each side.
+    """
     focal = 0.5 * image_size / jnp.tan(jnp.deg2rad(field_of_view) / 2)
     center = jnp.asarray(image_size / 2, focal.dtype)
     return Intrinsics(focal, focal, center, center)
 
 
 def intrinsics_of(K: Float[np.ndarray, "3 3"]) -> Intrinsics:
-    """The camera of a host's camera matrix.
+    """The camera of a camera matrix.
 
     Args:
-        K: fx 0 cx / 0 fy cy / 0 0 1, in pixels.
+        K: Camera matrix, fx 0 cx / 0 fy cy / 0 0 1, in pixels.
 
     Returns:
         The same numbers in float32.
@@ -44,10 +58,17 @@ def intrinsics_of(K: Float[np.ndarray, "3 3"]) -> Intrinsics:
 def project(
     intrinsics: Intrinsics, points: Float[Array, "*batch 3"]
 ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
-    """Camera-frame points to image coordinates `(u, v)` in pixels, and depth in metres.
+    """Project camera-frame points into the image.
 
-    Points at or behind the camera plane get finite but meaningless image coordinates; look at the
-    depth.
+    Points at or behind the camera plane get finite but meaningless image coordinates; their depth
+    tells them apart.
+
+    Args:
+        intrinsics: The camera.
+        points: Points in the camera frame `[*batch 3]`, in metres.
+
+    Returns:
+        Image coordinates `(u, v)` `[*batch 2]`, in pixels, and depth `[*batch]`, in metres.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     safe_z = jnp.where(z > 0, z, 1.0)
@@ -59,9 +80,16 @@ def project(
 def unproject(
     intrinsics: Intrinsics, depth: Float[Array, "*batch h w"]
 ) -> Float[Array, "*batch h w 3"]:
-    """The camera-frame point, in metres, that each pixel of a depth image measures.
+    """The camera-frame point that each pixel of a depth image measures.
 
-    Invalid (0) and empty (infinite) pixels give points at 0 and at infinity.
+    Args:
+        intrinsics: The camera.
+        depth: Depth image `[*batch h w]`, in metres; 0 where nothing is known, infinite where the
+            ray met nothing.
+
+    Returns:
+        Points `[*batch h w 3]`, in metres; at 0 for pixels of depth 0, and at infinity for those of
+        infinite depth.
     """
     h, w = depth.shape[-2:]
     u, v = jnp.arange(w) + 0.5, jnp.arange(h) + 0.5
@@ -73,14 +101,14 @@ def unproject(
 def look_up(
     image: Float[Array, "h w *channels"], pixels: Float[Array, "*batch 2"]
 ) -> Float[Array, "..."]:
-    """What an image holds at the pixel in which each image point lies.
+    """The values of an image at the pixels in which image points lie.
 
     Args:
-        image: Any number of values for each pixel, as a depth image or an image of points.
+        image: Any number of values for each pixel, for example a depth image or an image of points.
         pixels: Image coordinates `(u, v)`, in pixels.
 
     Returns:
-        The values, of shape `[*batch, *channels]`; 0, nothing known, outside the image.
+        The values `[*batch *channels]`; 0, for nothing known, outside the image.
     """
     h, w = image.shape[:2]
     column, row = pixels[..., 0], pixels[..., 1]
@@ -90,7 +118,14 @@ def look_up(
 
 
 def transform(T_a_b: jaxlie.SE3, points: Float[Array, "*batch n 3"]) -> Float[Array, "*batch n 3"]:
-    """Points of frame b in frame a; for whole clouds, a product with a matrix, not quaternions."""
+    """Take points of frame b to frame a.
+
+    For whole clouds a product with a matrix is faster than one with quaternions.
+
+    Args:
+        T_a_b: Pose of frame b in frame a.
+        points: Points in frame b `[*batch n 3]`, in metres.
+    """
     return points @ T_a_b.rotation().as_matrix().mT + T_a_b.translation()[..., None, :]
 
 
@@ -99,6 +134,10 @@ def look_at(eye: Float[Array, "*batch 3"], target: Float[Array, "*batch 3"]) -> 
 
     World +y is up and the image x-axis stays horizontal (paper, section 2.3), so looking straight
     up or down is undefined.
+
+    Args:
+        eye: Position of the camera in the world `[*batch 3]`, in metres.
+        target: Point that the principal axis passes through `[*batch 3]`, in metres.
     """
     forward = _unit(target - eye)
     up = jnp.array([0.0, 1.0, 0.0])
@@ -113,8 +152,11 @@ def on_sphere(
 ) -> jaxlie.SE3:
     """`T_object_camera` of cameras on a sphere that look at the origin.
 
-    Angles are in degrees: azimuth 0 stands in front of the object (+z) and grows towards its +x
-    side, elevation grows upwards. `radius` is in metres.
+    Args:
+        azimuth: Angle about +y `[*batch]`, in degrees: 0 in front of the object (+z), growing
+            towards its +x side.
+        elevation: Angle above the horizontal plane `[*batch]`, in degrees.
+        radius: Distance from the origin, in metres.
     """
     azimuth, elevation = jnp.deg2rad(azimuth), jnp.deg2rad(elevation)
     direction = jnp.stack(
@@ -129,9 +171,18 @@ def on_sphere(
 
 
 def random_views(key: PRNGKeyArray, count: int, radius: float) -> jaxlie.SE3:
-    """Training views: azimuth in [0, 360), elevation in [30, 60) degrees.
+    """Training views that look at the origin from random directions (paper, section 2.3).
 
-    The paper (section 2.3) prints the two ranges in swapped order.
+    Azimuth is uniform in [0, 360), elevation in [30, 60) degrees. The paper prints the two ranges
+    in swapped order.
+
+    Args:
+        key: Random key of the views.
+        count: Number of views, 1 or more.
+        radius: Distance from the origin, in metres.
+
+    Returns:
+        `T_object_camera` of each view `[count]`.
     """
     azimuth_key, elevation_key = jax.random.split(key)
     azimuth = jax.random.uniform(azimuth_key, (count,), minval=0.0, maxval=360.0)
@@ -140,7 +191,17 @@ def random_views(key: PRNGKeyArray, count: int, radius: float) -> jaxlie.SE3:
 
 
 def orbit(count: int, radius: float, *, elevation: float = 30.0, step: float = 20.0) -> jaxlie.SE3:
-    """Test views: frame j at azimuth `step * j` degrees, at one elevation (paper, section 4.1)."""
+    """Test views around the object at one elevation (paper, section 4.1).
+
+    Args:
+        count: Number of views, 1 or more; view j has the azimuth `step * j`.
+        radius: Distance from the origin, in metres.
+        elevation: Angle above the horizontal plane, in degrees, between -90 and 90.
+        step: Azimuth between neighbouring views, in degrees.
+
+    Returns:
+        `T_object_camera` of each view `[count]`; the first stands in front of the object.
+    """
     azimuth = step * jnp.arange(count, dtype=jnp.float32)
     return on_sphere(azimuth, jnp.full(count, elevation), radius)
 

@@ -18,16 +18,24 @@ from jaxshape.geometry.grid import RESOLUTION, GridFrame, flat_index
 
 
 class Measurement(NamedTuple):
-    """What a set of frames says about each voxel."""
+    """Evidence of a set of depth frames for each voxel; leading axes are batch axes.
+
+    Attributes:
+        hits: Measured surface points that fell into the voxel `[*batch x y z]`, 0 or more.
+        seen_through: True where some frame measured a surface behind the voxel's centre, or where
+            its ray met nothing `[*batch x y z]`.
+    """
 
     hits: Int[Array, "*batch x y z"]
-    """Measured surface points that fell into the voxel."""
     seen_through: Bool[Array, "*batch x y z"]
-    """True where some frame measured a surface behind the voxel's centre, or nothing at all."""
 
 
 def nothing_measured(resolution: int = RESOLUTION) -> Measurement:
-    """The measurement of no frames."""
+    """The measurement of no frames.
+
+    Args:
+        resolution: Voxels along each axis.
+    """
     shape = (resolution,) * 3
     return Measurement(jnp.zeros(shape, jnp.int32), jnp.zeros(shape, bool))
 
@@ -42,10 +50,20 @@ def measure(
 ) -> Measurement:
     """Discretise one depth frame: `D(T P)` of Eq. 6, and the space it looked through.
 
-    `depth` is in metres, 0 where nothing is known and infinite where the ray met nothing;
-    `segmented` is True on pixels that show the object. Only segmented pixels put points into
-    voxels, but every valid pixel looks through the space in front of it, so background frees space
-    and a foreign object in front keeps what is behind it occluded.
+    Only segmented pixels put points into voxels. Every valid pixel looks through the space in front
+    of it: background frees space, and a foreign object in front keeps what is behind it occluded.
+
+    Args:
+        depth: Depth image `[h w]`, in metres; 0 where nothing is known, infinite where the ray met
+            nothing.
+        segmented: True on pixels that show the object `[h w]`.
+        intrinsics: The camera, without batch axes.
+        T_object_camera: Pose of the camera in the object frame, without batch axes.
+        frame: Voxel frame of the grid, without batch axes.
+        resolution: Voxels along each axis of the grid.
+
+    Returns:
+        The measurement of this frame `[x y z]`.
     """
     # One affine map each way, and coordinates in arrays of their own: whatever happens to a pixel
     # or a voxel before it is counted or looked up is then one pass, many times as fast on CPU.
@@ -65,44 +83,80 @@ def measure(
 
 
 def merge(first: Measurement, second: Measurement) -> Measurement:
-    """The measurement of both sets of frames."""
+    """The measurement of two sets of frames together.
+
+    Args:
+        first: Measurement of one set of frames.
+        second: Measurement of another set, in the same voxel frame.
+    """
     return Measurement(first.hits + second.hits, first.seen_through | second.seen_through)
 
 
 def merge_all(frames: Measurement) -> Measurement:
-    """Merge the leading axis of frames."""
+    """The measurement of all frames together.
+
+    Args:
+        frames: Measurements `[frame *batch x y z]`, in the same voxel frame; the leading axis is
+            merged.
+    """
     return Measurement(frames.hits.sum(axis=0), frames.seen_through.any(axis=0))
 
 
 def merge_cumulative(frames: Measurement) -> Measurement:
-    """Merge the first 1, 2, ... frames of the leading axis; entry k holds frames 0 to k."""
+    """Merge the first 1, 2, ... frames.
+
+    Args:
+        frames: Measurements `[frame *batch x y z]`, in the same voxel frame.
+
+    Returns:
+        Measurements of the same shape; entry k holds frames 0 to k.
+    """
     seen_through = jnp.cumsum(frames.seen_through, axis=0) > 0
     return Measurement(jnp.cumsum(frames.hits, axis=0), seen_through)
 
 
 def occupied(measurement: Measurement, min_hits: int = 1) -> Bool[Array, "*batch x y z"]:
-    """The measurement grid **F**: voxels hit by at least `min_hits` points.
+    """The measurement grid **F**: voxels into which enough measured points fell (paper, Eq. 6).
 
-    The paper has `min_hits = 1`; more suppresses the stray points of a real sensor.
+    Args:
+        measurement: Measurement of all frames `[*batch x y z]`.
+        min_hits: Points that make a voxel occupied, 1 or more (paper: 1). More suppress the stray
+            points of a real sensor.
+
+    Returns:
+        True where the surface was measured `[*batch x y z]`.
     """
     return measurement.hits >= min_hits
 
 
 def occluded(measurement: Measurement, min_hits: int = 1) -> Bool[Array, "*batch x y z"]:
-    """The occlusion mask **M**: neither on the measured surface nor seen through by any frame."""
+    """The occlusion mask **M**: voxels neither on the measured surface nor seen through (paper,
+    section 3.2).
+
+    Args:
+        measurement: Measurement of all frames `[*batch x y z]`.
+        min_hits: Points that make a voxel occupied, 1 or more, as for `occupied`.
+
+    Returns:
+        True where nothing is known `[*batch x y z]`.
+    """
     return ~(occupied(measurement, min_hits) | measurement.seen_through)
 
 
 def count_points(voxels: Float[Array, "n 3"], resolution: int = RESOLUTION) -> Int[Array, "x y z"]:
-    """How many points, given in voxel coordinates, fall into each voxel: the paper's `D(.)`.
+    """Count the points that fall into each voxel: the paper's `D(.)`.
 
     Points outside the grid, and those that are not finite, are dropped.
+
+    Args:
+        voxels: Points in voxel coordinates `[n 3]`.
+        resolution: Voxels along each axis.
     """
     return _count(voxels.T, resolution)
 
 
 def _count(coordinates: Iterable[Float[Array, "..."]], resolution: int) -> Int[Array, "x y z"]:
-    """How many points fall into each voxel, from their x, y and z."""
+    """Count the points that fall into each voxel, from their x, y and z."""
     index = flat_index(coordinates, resolution).ravel()
     hits = jnp.zeros(resolution**3, jnp.int32).at[index].add(1, mode="drop")
     return hits.reshape((resolution,) * 3)

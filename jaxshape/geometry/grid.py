@@ -19,15 +19,17 @@ whole number, or rounding would decide into which voxels the faces of the boundi
 
 
 class GridFrame(NamedTuple):
-    """Maps the object frame to voxel coordinates, each axis with its own scale.
+    """The map from the object frame to voxel coordinates; each axis has its own scale.
 
     `voxel = (point - origin) / voxel_size`. Leading axes are batch axes.
+
+    Attributes:
+        origin: Object-frame position of voxel coordinate (0, 0, 0) `[*batch 3]`, in metres.
+        voxel_size: Edge lengths of one voxel `[*batch 3]`, in metres, above 0.
     """
 
     origin: Float[Array, "*batch 3"]
-    """Object-frame position of voxel coordinate (0, 0, 0), in metres."""
     voxel_size: Float[Array, "*batch 3"]
-    """Edge lengths of one voxel, in metres."""
 
 
 def fit_box(
@@ -39,9 +41,16 @@ def fit_box(
 ) -> GridFrame:
     """Scale each axis on its own so that the box fills the grid up to the margin.
 
-    The anisotropic scaling and shift of the paper, section 2.3: made once per object, from its
-    CAD model or its given box, then applied unchanged to every partial view. `lower` and `upper`
-    are opposite corners in the object frame, in metres.
+    This is the anisotropic scaling and shift of the paper (section 2.3). It is made once for each
+    object, from its CAD model or its given box, and then applied unchanged to every partial view.
+
+    Args:
+        lower: Corner of the box with the smallest coordinates `[*batch 3]`, in the object frame, in
+            metres.
+        upper: Corner of the box with the largest coordinates `[*batch 3]`, in the object frame, in
+            metres.
+        resolution: Voxels along each axis of the grid, more than twice the margin.
+        margin: Voxels left free on each side of the box, 0 or more.
     """
     voxel_size = (upper - lower) / (resolution - 2 * margin)
     return GridFrame(lower - margin * voxel_size, voxel_size)
@@ -54,9 +63,17 @@ def fit_box_isotropic(
     resolution: int = RESOLUTION,
     margin: float = MARGIN,
 ) -> GridFrame:
-    """One scale for all axes: the longest side fills the grid, the others are centred.
+    """One scale for all axes: the longest side fills the grid, and the others are centred.
 
-    What the paper uses on real data (section 3.1), where only the measured points are known.
+    The paper scales so on real data (section 3.1), where only the measured points are known.
+
+    Args:
+        lower: Corner of the box with the smallest coordinates `[*batch 3]`, in the object frame, in
+            metres.
+        upper: Corner of the box with the largest coordinates `[*batch 3]`, in the object frame, in
+            metres.
+        resolution: Voxels along each axis of the grid, more than twice the margin.
+        margin: Voxels left free on each side of the longest side, 0 or more.
     """
     half_side = jnp.max(upper - lower, axis=-1, keepdims=True) / 2
     centre = (lower + upper) / 2
@@ -66,14 +83,24 @@ def fit_box_isotropic(
 def voxel_from_object(
     frame: GridFrame, points: Float[Array, "*batch n 3"]
 ) -> Float[Array, "*batch n 3"]:
-    """Object-frame points, in metres, to voxel coordinates."""
+    """Take object-frame points to voxel coordinates.
+
+    Args:
+        frame: Voxel frame of the grid.
+        points: Points in the object frame `[*batch n 3]`, in metres.
+    """
     return (points - frame.origin[..., None, :]) / frame.voxel_size[..., None, :]
 
 
 def object_from_voxel(
     frame: GridFrame, voxels: Float[Array, "*batch n 3"]
 ) -> Float[Array, "*batch n 3"]:
-    """Voxel coordinates to object-frame points, in metres."""
+    """Take voxel coordinates to object-frame points, in metres.
+
+    Args:
+        frame: Voxel frame of the grid.
+        voxels: Points in voxel coordinates `[*batch n 3]`.
+    """
     return frame.origin[..., None, :] + voxels * frame.voxel_size[..., None, :]
 
 
@@ -83,8 +110,8 @@ def flat_index(
     """The voxel that holds each point, as an index into a raveled grid.
 
     Args:
-        coordinates: x, y and z of the points, in voxels; each an array of its own, of one shape or
-            of shapes that broadcast, for that is one pass on CPU.
+        coordinates: x, y and z of the points, in voxels: three arrays of one shape, or of shapes
+            that broadcast. Separate arrays need only one pass on CPU.
         resolution: Voxels along each axis.
 
     Returns:

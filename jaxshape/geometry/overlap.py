@@ -1,4 +1,4 @@
-"""How much two grids of voxels have in common."""
+"""Overlap of two voxel grids."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,19 +14,20 @@ def iou(
 ) -> Float[Array, "..."]:
     """Intersection over union of the occupied voxels.
 
-    The true union, where the paper prints a sum (section 4): |A and B| / |A or B|. Two empty
+    |A and B| / |A or B|, with the true union, where the paper prints a sum (section 4). Two empty
     grids agree: 1.
 
     Args:
-        predicted: Occupied voxels: booleans, or integers that are 0 or 1. Leading axes broadcast.
-        truth: The same of the true shape.
+        predicted: Occupied voxels `[*batch x y z]`: booleans, or integers that are 0 or 1. Leading
+            axes broadcast.
+        truth: Occupied voxels of the true shape `[*batch x y z]`, in the same form.
 
     Returns:
-        One number between 0 and 1 for each pair of grids.
+        One number from 0 to 1 for each pair of grids `[*batch]`.
 
     Raises:
-        ValueError: For grids of anything else, such as probabilities or logits. Under `jax.jit`
-            the values of integers are not known: there, all but 0 is occupied.
+        ValueError: A grid holds anything else, such as probabilities or logits. Under `jax.jit` the
+            values of integers are not known: there, all but 0 is occupied.
     """
     a, b = _occupied(predicted, "predicted"), _occupied(truth, "truth")
     intersection = jnp.sum(a & b, axis=AXES)
@@ -37,7 +38,7 @@ def iou(
 def _occupied(
     grid: Shaped[Array | np.ndarray, "..."], name: str
 ) -> Bool[Array | np.ndarray, "..."]:
-    """The voxels of a grid as booleans; ValueError where they are neither true nor false."""
+    """The voxels of a grid as booleans; `ValueError` where they are neither true nor false."""
     if grid.dtype == bool:
         return grid
     if not jnp.issubdtype(grid.dtype, jnp.integer):

@@ -1,6 +1,6 @@
-"""How far the depths of a structured-light sensor, such as the first Kinect, are off.
+"""Depth errors of a structured-light sensor, such as the first Kinect.
 
-All of it grows with the square of depth: the sensor measures disparity, which is its inverse
+They grow with the square of depth, since the sensor measures disparity, the inverse of depth
 (Khoshelham and Elberink, Sensors, 2012; Nguyen, Izadi and Lovell, 3DIMPVT, 2012).
 """
 
@@ -21,31 +21,32 @@ SMALLEST_DEVIATION = 5e-4
 """Standard deviation of the depth of near things, in metres."""
 
 UNEVENNESS = 5e-3
-"""How far, in metres, a floor or a wall may lie off a plane."""
+"""Largest distance of a floor or a wall from a plane, in metres."""
 
 SPREAD = 5e-3
 """Three standard deviations of the noise and half a step, in metres at 1 m, rounded."""
 
 
 def depth_deviation(depth: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Standard deviation of a measured depth: noise and quantisation.
+    """Standard deviation of a measured depth, from noise and quantisation.
 
     Args:
-        depth: Metres.
+        depth: Measured depths `[*batch]`, in metres.
 
     Returns:
-        Metres; never below half a millimetre.
+        Standard deviations `[*batch]`, in metres, at least half a millimetre.
     """
     return jnp.maximum(DEVIATION * depth**2, SMALLEST_DEVIATION)
 
 
 def tolerance(depth: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarray, "*n"]:
-    """How far a measured point may lie from the plane that holds it.
+    """The distance at which a measured point still counts as lying on a plane.
 
     Args:
-        depth: Of the point, in metres.
+        depth: Depths of the points `[*n]`, in metres.
 
     Returns:
-        Metres: nearly all that the sensor adds, and what a floor that is not flat does.
+        Distances `[*n]`, in metres: nearly all of the sensor error, and the unevenness of a real
+        floor or wall.
     """
     return UNEVENNESS + SPREAD * depth**2

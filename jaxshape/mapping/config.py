@@ -1,4 +1,7 @@
-"""Settings of tracking and mapping; free of JAX, so that the command line can show them at once."""
+"""Settings of tracking and mapping.
+
+Nothing here imports JAX, so that the command line answers at once.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,23 +11,33 @@ from jaxshape import checks
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """How the pose of a frame is found, and when it is believed."""
+    """Settings of tracking: how the pose of a frame is found, and when it is believed.
+
+    Attributes:
+        against: Align with the last keyframe and the surface of the map, or with the keyframe
+            alone.
+        on: Align all pixels, where the camera moves through a still room; or those of the object,
+            where it turns before a still camera.
+        min_inliers: Share of the points expected to be seen again that must agree, from 0 to 1.
+        sure_inliers: Share of the same points below which many other guesses are tried, from 0 to
+            1: wrong poses explain up to that much.
+        min_overlap: Share of all points that must be expected to be seen again, from 0 to 1.
+        max_angle: Angle from the expected pose beyond which a pose is not believed, in degrees,
+            above 0.
+        max_distance: Distance from the expected pose beyond which a pose is not believed, in
+            metres, above 0.
+
+    Raises:
+        ValueError: A setting is outside its range.
+    """
 
     against: Literal["map", "keyframe"] = "map"
-    """Align with the last keyframe and the surface of the map, or with the keyframe alone."""
     on: Literal["scene", "object"] = "scene"
-    """Align all pixels, where the camera moves through a still room; or those of the object, where
-    it turns before a still camera."""
     min_inliers: float = 0.75
-    """Share of the points, of those that should be seen again, that must agree."""
     sure_inliers: float = 0.9
-    """The same, below which many other guesses are tried: wrong poses explain up to that much."""
     min_overlap: float = 0.25
-    """Share of the points that must be seen again."""
     max_angle: float = 35.0
-    """Degrees from the expected pose beyond which a pose is not believed."""
     max_distance: float = 0.5
-    """Metres from the expected pose beyond which a pose is not believed."""
 
     def __post_init__(self) -> None:
         checks.one_of("against", self.against, ("map", "keyframe"))
@@ -37,21 +50,31 @@ class TrackingConfig:
 
 @dataclass(frozen=True)
 class MappingConfig:
-    """When a frame becomes a keyframe, and what the map makes of it."""
+    """Settings of mapping: when a frame becomes a keyframe, and how keyframes are fused and
+    searched.
+
+    Attributes:
+        keyframe_angle: Angle between neighbouring keyframes as seen from the object, in degrees,
+            above 0.
+        keyframe_distance: Distance between neighbouring keyframes, in metres, above 0.
+        realign: Realign all keyframes with the refined shape after each new one.
+        isotropic: Scale all axes of the grid alike, as the paper does on real data, instead of
+            filling the box.
+        min_hits: Depth points that make a voxel occupied, 1 or more (paper: 1). More suppress stray
+            points.
+        keyframe_iterations: Steps of the search after each keyframe, from the code found so far, 1
+            or more.
+
+    Raises:
+        ValueError: A setting is outside its range.
+    """
 
     keyframe_angle: float = 10.0
-    """Degrees between neighbouring keyframes, as seen from the object."""
     keyframe_distance: float = 0.25
-    """Metres between neighbouring keyframes."""
     realign: bool = True
-    """Realign all keyframes with the refined shape after each new one."""
     isotropic: bool = False
-    """Scale all axes of the grid alike, as the paper does on real data, instead of filling the
-    box."""
     min_hits: int = 3
-    """Depth points that make a voxel occupied; the paper has 1, more suppress stray points."""
     keyframe_iterations: int = 40
-    """Steps of the search after each keyframe, from the code found so far."""
 
     def __post_init__(self) -> None:
         checks.positive("keyframe_angle", self.keyframe_angle, "degrees")

@@ -15,7 +15,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.evidence import Grids, binary
 from jaxshape.model.config import Architecture
 from jaxshape.model.convolution import (
     KERNEL_SIZE,
@@ -35,13 +35,18 @@ LEAKY_SLOPE = 0.2
 
 
 class AutoEncoder(nn.Module):
-    """Encoder and decoder without skip connections, so that either can be used alone."""
+    """Encoder and decoder without skip connections, so that either can be used alone.
+
+    Attributes:
+        architecture: Sizes of the network.
+        dtype: Type of the arithmetic of convolutions; parameters and batch statistics stay float32.
+        axis: Mesh axis over which a batch is spread, so that its statistics are those of the whole
+            batch; None where it is not spread.
+    """
 
     architecture: Architecture = Architecture()
     dtype: DTypeLike = jnp.float32
-    """Of the convolutions' arithmetic; parameters and batch statistics stay float32."""
     axis: str | None = None
-    """Mesh axis over which a batch is spread, if it is: its statistics are those of all of it."""
 
     def setup(self):
         self.encoder = Encoder(self.architecture, self.dtype, self.axis)
@@ -67,7 +72,7 @@ class AutoEncoder(nn.Module):
 class Encoder(nn.Module):
     """32 -> 16 -> 8 -> 4 -> 2 by strided convolutions, then pooling and a 1^3 convolution.
 
-    Each further layer takes a grid of twice the resolution.
+    Each further layer takes a grid of twice the resolution. The fields are those of `AutoEncoder`.
     """
 
     architecture: Architecture
@@ -85,7 +90,10 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions; each further layer doubles again."""
+    """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions; each further layer doubles again.
+
+    The fields are those of `AutoEncoder`.
+    """
 
     architecture: Architecture
     dtype: DTypeLike
@@ -134,7 +142,7 @@ def initialize(key: PRNGKeyArray, architecture: Architecture = Architecture()) -
         key: Random key of the first weights.
         architecture: Sizes of the network.
     """
-    grid = jnp.zeros((1, *[architecture.resolution] * 3))
+    grid = jnp.zeros((1, *[architecture.resolution] * 3), jnp.float32)
     # Under jit the forward pass, which Flax traces to find the shapes, is left out.
     return jax.jit(partial(AutoEncoder(architecture).init, train=False))(key, grid)
 
@@ -143,7 +151,7 @@ def architecture_of(params: PyTree) -> Architecture:
     """Read the sizes off the parameters.
 
     Args:
-        params: Those of an auto-encoder, as arrays or their shapes.
+        params: Parameters of an auto-encoder, as arrays or as their shapes.
     """
     encoder, decoder = params["params"]["encoder"], params["params"]["decoder"]
     depth = sum(name.startswith("conv") for name in encoder)
@@ -161,21 +169,26 @@ def shapes(params: PyTree) -> PyTree:
 
 
 def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
-    """The code of F; M is not looked at."""
+    """The code of F, rounded where it is soft; the encoder does not use M."""
     network = AutoEncoder(architecture_of(params))
-    return jnp.asarray(network.apply(params, grids.occupied.astype(jnp.float32), method="encode"))
+    F = binary(grids).occupied.astype(jnp.float32)
+    return jnp.asarray(network.apply(params, F, method="encode"))
 
 
 class PreparedDecoder(NamedTuple):
-    """A decoder for many calls, with everything done that does not depend on the code.
+    """A decoder for many calls, with all work done that does not depend on the code.
 
     Batch normalisation is folded into the layer before it.
+
+    Attributes:
+        first: Kernel of the first layer, from a code to 4^3 voxels.
+        kernels: Prepared kernels of the further layers.
+        biases: One bias for each layer; the last is that of the output, a scalar.
     """
 
     first: Float[Array, "4 4 4 channels d"]
     kernels: tuple[PreparedKernel, ...]
     biases: tuple[Float[Array, "..."], ...]
-    """One per layer; the last is the output's, a scalar."""
 
 
 def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:

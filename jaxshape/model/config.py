@@ -1,4 +1,7 @@
-"""Sizes of the auto-encoder and settings of its training; free of JAX, for the command line."""
+"""Sizes of the auto-encoder and settings of its training.
+
+Nothing here imports JAX, so that the command line answers at once.
+"""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -9,7 +12,7 @@ from jaxshape.data.config import InputConfig
 Optimizer = Literal["muon", "adam"]
 Schedule = Literal["cosine", "constant"]
 Precision = Literal["float32", "bfloat16"]
-"""Of the matrix products of a decoder."""
+"""Precision of a decoder's matrix products."""
 
 
 @dataclass(frozen=True)
@@ -20,13 +23,13 @@ class Architecture:
     more for 64^3, one less for 16^3.
 
     Attributes:
-        encoder: Channels after each strided convolution.
-        decoder: Channels after each transposed convolution but the last, which has one channel:
-            one entry fewer than `encoder`.
-        code: Numbers in a code (paper: 100).
+        encoder: Channels after each strided convolution, each 1 or more.
+        decoder: Channels after each transposed convolution but the last, which has one channel: one
+            entry fewer than `encoder`, each 1 or more.
+        code: Numbers in a code, 2 or more (paper: 100).
 
     Raises:
-        ValueError: The layers of encoder and decoder do not match, or a size is not positive.
+        ValueError: The layers of encoder and decoder do not match, or a size is outside its range.
     """
 
     encoder: tuple[int, ...] = (32, 64, 128, 256)
@@ -53,38 +56,49 @@ class Architecture:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a training run, besides its dataset and the weights it starts from.
+    """Settings of a training run, besides its dataset and the weights it starts from.
 
     The defaults are the preset `default`.
+
+    Attributes:
+        architecture: Sizes of the network.
+        inputs: How pairs are drawn from the dataset.
+        steps: Batches in all, 1 or more.
+        batch: Pairs in a batch, over all devices, 1 or more.
+        optimizer: Adam (paper), or Muon, which orthogonalises the steps of the kernels: it reaches
+            in a third of the samples what Adam reaches.
+        learning_rate: Peak of the optimiser's step size, above 0 (paper: 1e-4, of Adam).
+        schedule: Whether the step size warms up and decays to zero along a cosine, or stays
+            constant (paper).
+        occupied_weight: Weight of occupied voxels in the loss, above 0 (paper: 1). At 1.5 a voxel
+            counts as occupied from a probability of 0.4 on, where the IoU of shapes as uncertain as
+            these is better than at 0.5.
+        code_noise: Standard deviation of noise added to the codes, 0 or more.
+        code_weight: Weight of half the squared length of a code, in nats, in the loss of its grid,
+            0 or more: with noise of 1, the KL divergence of a variational auto-encoder whose
+            posterior has variance 1.
+        bfloat16: Compute convolutions in bfloat16; parameters, statistics and Adam stay in float32.
+        report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
+            on from the last checkpoint.
+        seed: Seed of the first weights and of the batches, 0 or more.
+
+    Raises:
+        ValueError: A setting is outside its range.
     """
 
     architecture: Architecture = Architecture()
     inputs: InputConfig = InputConfig()
     steps: int = 10_000
-    """Batches in all."""
     batch: int = 32
-    """Pairs in a batch, over all devices."""
     optimizer: Optimizer = "muon"
-    """Adam (paper), or Muon, which orthogonalises the steps of the kernels: it reaches in a third
-    of the samples what Adam reaches."""
     learning_rate: float = 4e-3
-    """Peak of the optimiser's step size (paper: 1e-4, of Adam)."""
     schedule: Schedule = "cosine"
-    """Whether the step size warms up and decays to zero along a cosine, or stays (paper)."""
     occupied_weight: float = 1.5
-    """Of occupied voxels in the loss (paper: 1). At 1.5 a voxel counts as occupied from a
-    probability of 0.4 on, where the IoU of shapes as uncertain as these is better than at 0.5."""
     code_noise: float = 0.0
-    """Standard deviation of noise added to the codes."""
     code_weight: float = 0.0
-    """Of half the squared length of a code, in nats, in the loss of its grid: with noise of 1, the
-    KL divergence of a variational auto-encoder whose posterior has variance 1."""
     bfloat16: bool = False
-    """Compute convolutions in bfloat16; parameters, statistics and Adam stay in float32."""
     report_every: int = 100
-    """Steps between checkpoints and lines of metrics; a killed run goes on from the last."""
     seed: int = 0
-    """Of the first weights and of the batches."""
 
     def __post_init__(self) -> None:
         checks.one_of("optimizer", self.optimizer, get_args(Optimizer))

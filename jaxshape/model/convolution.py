@@ -63,11 +63,15 @@ def upsample(
 
 
 class PreparedKernel(NamedTuple):
-    """A kernel for many calls of `upsample_prepared`, with what need not be done again for each."""
+    """A kernel for many calls of `upsample_prepared`, with the work done that all calls share.
+
+    Attributes:
+        kernel: The kernel itself.
+        tiles: The transformed kernel; None where fast convolution does not pay.
+    """
 
     kernel: Float[Array, "5 5 5 fine coarse"]
     tiles: Float[Array, "36 taps phases"] | None
-    """The transformed kernel, where fast convolution pays once the transform is free."""
 
 
 def prepare_kernel(kernel: Float[Array, "5 5 5 fine coarse"], side: int) -> PreparedKernel:
@@ -103,7 +107,7 @@ def upsample_prepared(
 
 
 def _kernel_gradient(fine, coarse, kernel_like):
-    """How the inner product of `downsample(fine, kernel)` with `coarse` moves with the kernel."""
+    """Gradient, by the kernel, of the inner product of `downsample(fine, kernel)` with `coarse`."""
     gradient = lax.platform_dependent(
         fine, coarse, cpu=_kernel_gradient_cpu, default=_kernel_gradient_xla
     )
@@ -174,7 +178,7 @@ def _kernel_gradient_cpu(fine, coarse):
     if not _tiled(coarse.shape, shape):
         return sum_chunks(_gradient_of_taps, size, fine, coarse).reshape(shape)
     total = sum_chunks(gradient_of_tiles, size, fine, coarse)
-    return jax.linear_transpose(transform_kernel, jnp.zeros(shape))(total)[0]
+    return jax.linear_transpose(transform_kernel, jnp.zeros(shape, jnp.float32))(total)[0]
 
 
 def _tiled(coarse_shape, kernel_shape) -> bool:
@@ -183,7 +187,7 @@ def _tiled(coarse_shape, kernel_shape) -> bool:
 
 
 def _in_cache(values: int) -> int:
-    """How many examples can be worked on together that gather so many values each."""
+    """Number of examples whose gathered values, so many each, fit into the cache together."""
     return max(1, CACHE_BYTES // (4 * values))
 
 
@@ -199,7 +203,7 @@ def _gather_taps_then_multiply(fine, kernel):
 
 
 def _gradient_of_taps(fine, coarse):
-    """The same gathered taps, against the coarse side, summed over examples."""
+    """Products of the gathered taps with the coarse side, summed over examples."""
     columns = coarse.reshape(-1, coarse.shape[-1])
     planes = _gather_taps(fine)
     return jnp.stack([_matmul(plane.reshape(columns.shape[0], -1).T, columns) for plane in planes])

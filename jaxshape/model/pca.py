@@ -22,7 +22,7 @@ OVERSAMPLING = 10
 
 
 def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
-    """The most probable code given F where something was measured; M weighs the voxels."""
+    """The most probable code given F, from the voxels that are not occluded."""
     components = params["components"]
     noise = params["noise"]
 
@@ -65,9 +65,9 @@ def fit(surfaces: Bool[np.ndarray, "n x y z"], code: int, seed: int = 0) -> Shap
     """The principal components of complete surfaces. [host]
 
     Args:
-        surfaces: Occupancy grids of the training set, more than `code` of them.
+        surfaces: Occupancy grids of the training set `[n x y z]`, more than `code` of them.
         code: Components to keep, the numbers in a code.
-        seed: Of the randomised decomposition.
+        seed: Seed of the randomised decomposition.
 
     Returns:
         A shape prior of the model `PCA`; its codes have mean 0 and a diagonal covariance.

@@ -43,7 +43,7 @@ class Prepared(NamedTuple):
 
 
 def share_all(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
-    """The `prepare` of models without anything to prepare: the parameters as they are."""
+    """The `prepare` of models that have nothing to prepare: the parameters as they are."""
     del grids, precision
     return Prepared(params)
 
@@ -59,11 +59,11 @@ class ShapeModel:
         decode: `(prepared, codes [n d]) -> logits [n x y z]`, occupied where positive.
             Differentiable in the codes.
         prepare: `(params, grids [b ...] | None, precision) -> Prepared`, called once per search.
-            `precision` is that of the products of `decode`. A model that decodes from the code
+            `precision` is that of the decoder's matrix products. A model that decodes from the code
             alone ignores the grids, and works without any.
         shapes: `params -> ` the same tree of `jax.ShapeDtypeStruct`, for a model of the sizes that
-            the parameters seem to have; loading compares weights files with it. None compares
-            nothing but what `encode` and `decode` return.
+            the parameters seem to have; loading compares weights files with it. None compares only
+            the results of `encode` and `decode`.
     """
 
     kind: str
@@ -74,14 +74,14 @@ class ShapeModel:
 
 
 class ShapePrior(NamedTuple):
-    """A trained shape model, and where in its code space the training shapes lie.
+    """A trained shape model, with the distribution of the training codes.
 
     Attributes:
-        model: The functions, static under `jax.jit`.
-        params: Their parameters, a pytree of arrays.
+        model: Functions of the model, static under `jax.jit`.
+        params: Parameters of these functions, a pytree of arrays.
         code_mean: Mean code of the training set `[d]`.
-        code_covariance: Covariance of the codes of the training set `[d d]`, positive definite: the
-            scale on which a search takes its steps.
+        code_covariance: Covariance of the codes of the training set `[d d]`, positive definite. It
+            sets the scale of the steps of a search.
     """
 
     model: ShapeModel
@@ -91,7 +91,7 @@ class ShapePrior(NamedTuple):
 
     @property
     def code_size(self) -> int:
-        """Numbers in a code."""
+        """Numbers in a code, d."""
         return self.code_mean.shape[-1]
 
     @property
@@ -101,7 +101,7 @@ class ShapePrior(NamedTuple):
 
 
 def resolution_of(model: ShapeModel, params: PyTree, code_size: int) -> int:
-    """Voxels along each axis of what a model decodes."""
+    """Voxels along each axis of the grids that a model decodes."""
 
     def decoded(params):
         prepared = model.prepare(params, None, "float32")
@@ -111,14 +111,14 @@ def resolution_of(model: ShapeModel, params: PyTree, code_size: int) -> int:
 
 
 def encode(prior: ShapePrior, grids: Grids) -> Float[Array, "*batch d"]:
-    """The code that a model proposes for what was measured: the start of a search (section 3.1).
+    """The code that a model proposes for a measurement: the start of a search (section 3.1).
 
     Args:
-        prior: A shape prior.
-        grids: F and M at the prior's resolution, with any leading axes.
+        prior: The shape prior.
+        grids: F and M `[*batch x y z]`, at the prior's resolution.
 
     Returns:
-        One code for each object.
+        One code for each object `[*batch d]`.
 
     Raises:
         ValueError: The grids are not of the prior's resolution.
@@ -139,10 +139,14 @@ def decode(
     The paper's output in (0, 1) is `jax.nn.sigmoid(logits)`.
 
     Args:
-        prior: A shape prior.
-        code: Codes with any leading axes, decoded by one call in bounded memory.
-        grids: F and M `[b ...]` of the objects, for models whose decoder is given the measurement;
-            the first axis of `code` is then theirs.
+        prior: The shape prior.
+        code: Codes with any leading axes `[*batch d]`, decoded by one call in bounded memory.
+        grids: F and M of the objects `[b x y z]`, for models whose decoder takes the measurement;
+            the first axis of `code` is then that of the objects. None for models that decode from
+            the code alone.
+
+    Returns:
+        Logits of each code `[*batch x y z]`.
     """
     prepared = prior.model.prepare(prior.params, grids, "float32")
     return decode_prepared(prior.model, prepared, code)
@@ -154,10 +158,13 @@ def decode_prepared(
     """`decode` with parameters that are prepared already.
 
     Args:
-        model: The model that prepared them.
-        prepared: Its parameters. Where it holds features of b objects, the first axis of `code`
-            has b entries.
-        code: Codes with any leading axes.
+        model: The model that prepared the parameters.
+        prepared: Prepared parameters, from `model.prepare`. Where they hold features of b objects,
+            the first axis of `code` has b entries.
+        code: Codes with any leading axes `[*batch d]`.
+
+    Returns:
+        Logits of each code `[*batch x y z]`, occupied where positive.
     """
     batch = code.shape[:-1]
     rows = code.reshape(-1, code.shape[-1])

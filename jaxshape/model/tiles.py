@@ -105,7 +105,7 @@ def downsample_tiles(
 ) -> Float[Array, "b x//2 y//2 z//2 {matrices.shape[-2]//3}"]:
     """Convolve with a transformed kernel: the adjoint of `upsample_tiles` by its grid."""
     b, *sizes, _ = fine.shape
-    coarse = jnp.zeros((b, *[n // 2 for n in sizes], matrices.shape[1] // 3))
+    coarse = jnp.zeros((b, *[n // 2 for n in sizes], matrices.shape[1] // 3), jnp.float32)
     up = lambda coarse: upsample_tiles(coarse, matrices)  # noqa: E731
     return jax.linear_transpose(up, coarse)(fine.astype(jnp.float32))[0]
 
@@ -113,7 +113,8 @@ def downsample_tiles(
 def gradient_of_tiles(
     fine: Float[Array, "b x y z fine"], coarse: Float[Array, "b _ _ _ coarse"]
 ) -> Float[Array, "36 3*coarse 8*fine"]:
-    """By the transformed kernel: the adjoint of `upsample_tiles` by its matrices."""
-    matrices = jnp.zeros((POINTS**2, 3 * coarse.shape[-1], 8 * fine.shape[-1]))
+    """Gradient by the transformed kernel: the adjoint of `upsample_tiles` by its matrices."""
+    shape = (POINTS**2, 3 * coarse.shape[-1], 8 * fine.shape[-1])
+    matrices = jnp.zeros(shape, jnp.float32)
     up = lambda matrices: upsample_tiles(coarse, matrices)  # noqa: E731
     return jax.linear_transpose(up, matrices)(fine.astype(jnp.float32))[0]

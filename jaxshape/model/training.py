@@ -40,32 +40,44 @@ from jaxshape.model.weights import fingerprint, flatten
 
 
 class TrainState(NamedTuple):
-    """What the next step needs."""
+    """State of a training run between two steps.
+
+    Attributes:
+        step: Steps taken so far.
+        variables: Flax collections `params` and `batch_stats`.
+        optimizer: State of the optimiser.
+    """
 
     step: Int[Array, ""]
     variables: PyTree
-    """Flax collections `params` and `batch_stats`."""
     optimizer: PyTree
 
 
 class Report(NamedTuple):
-    """Means over the steps since the last report."""
+    """Means over the steps since the last report.
+
+    Attributes:
+        step: Steps taken so far.
+        loss: Training loss, in nats per voxel (paper, section 2.3).
+        iou: IoU of the completed training grids, at threshold 0.5, from 0 to 1.
+        samples_per_second: Pairs per second.
+        seconds: Time spent on these steps.
+    """
 
     step: int
     loss: float
-    """Of training, in nats per voxel (paper, section 2.3)."""
     iou: float
-    """Of the completed training grids, at threshold 0.5."""
     samples_per_second: float
     seconds: float
-    """Spent on these steps."""
 
 
 # ------------------------------------------------------------------ one step
 
 
 def optimizer_for(config: TrainConfig) -> optax.GradientTransformation:
-    """Adam with the paper's betas, or Muon for the kernels and Adam for the rest."""
+    """The optimiser of a run: Adam with the paper's betas, or Muon for the kernels and Adam for the
+    rest.
+    """
     schedule = config.learning_rate
     if config.schedule == "cosine":
         warmup = min(200, config.steps // 10)
@@ -86,7 +98,15 @@ def _as_matrix(weights: Array) -> MuonDimensionNumbers | None:
 
 
 def initial_state(config: TrainConfig, start: ShapePrior | None = None) -> TrainState:
-    """Random weights, or those of a shape prior to go on from."""
+    """The state of a run before its first step.
+
+    Args:
+        config: Settings of the run.
+        start: Shape prior to go on from; None for random weights.
+
+    Raises:
+        ValueError: The weights to start from are of another model or of other sizes.
+    """
     if start is None:
         variables = initialize(jax.random.key(config.seed), config.architecture)
     elif start.model != AUTOENCODER:
@@ -113,10 +133,20 @@ def train_step(
     config: TrainConfig,
     axis: str | None = None,
 ) -> tuple[TrainState, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """One step of Adam on a batch; also its loss and mean IoU.
+    """One step of the optimiser on a batch.
 
-    Where the batch is spread over devices, `axis` names the mesh axis; each holds its part, and
-    statistics, gradients and figures are those of the whole.
+    Where the batch is spread over devices, each holds its part, and statistics, gradients and
+    figures are those of the whole.
+
+    Args:
+        state: State before the step.
+        measured: Measurement grids F of the batch `[b x y z]`.
+        surface: Complete surfaces of the batch `[b x y z]`.
+        config: Settings of the run.
+        axis: Mesh axis over which the batch is spread; None where it is not spread.
+
+    Returns:
+        The state after the step, and the loss, in nats per voxel, and the mean IoU of the batch.
     """
     dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32
     network = AutoEncoder(config.architecture, dtype, axis)
@@ -188,13 +218,25 @@ def train(
     config: TrainConfig,
     start: ShapePrior | None = None,
 ) -> Iterator[Report]:
-    """Train until `config.steps`, from the checkpoint in `folder` where there is one.
+    """Train until `config.steps`, from the checkpoint in the folder where there is one. [host]
 
-    Begins with the weights of `start` if any are given. Each batch is spread over all devices, of
-    all processes where there are several (`jax.distributed`): each process reads its own part of
-    the dataset, and the first alone reads and writes `folder`. Adds to `metrics.jsonl` and replaces
-    `checkpoint.safetensors` at every report. `ValueError` when the folder holds a run of other
-    settings, or a batch cannot be divided.
+    Each batch is spread over all devices, of all processes where there are several
+    (`jax.distributed`): each process reads its own part of the dataset, and the first alone reads
+    and writes the folder. Adds to `metrics.jsonl` and replaces `checkpoint.safetensors` at every
+    report.
+
+    Args:
+        folder: Folder of the run; made if missing.
+        dataset: Training pairs, of the resolution of the network.
+        config: Settings of the run.
+        start: Shape prior to go on from; None for random weights.
+
+    Yields:
+        A report after every `config.report_every` steps and after the last.
+
+    Raises:
+        ValueError: The folder holds a run of other settings, the resolutions differ, the weights to
+            start from do not fit, or a batch cannot be divided among the devices.
     """
     folder = Path(folder)
     if dataset.resolution != config.architecture.resolution:
@@ -249,7 +291,14 @@ def _parallel_step(config: TrainConfig, mesh: Mesh):
 def finished_prior(
     folder: str | os.PathLike[str], dataset: Dataset, config: TrainConfig, *, samples: int = 4096
 ) -> ShapePrior:
-    """The shape prior of a finished run, with the statistics of the training set's codes."""
+    """The shape prior of a finished run, with the statistics of the training set's codes. [host]
+
+    Args:
+        folder: Folder of the run.
+        dataset: Its training pairs.
+        config: Settings of the run.
+        samples: Codes from which the statistics are computed, at most.
+    """
     variables = _read_checkpoint(Path(folder) / "checkpoint.safetensors", config).variables
     many = replace(config, batch=64, seed=config.seed + 1)
     d = config.architecture.code
@@ -275,7 +324,7 @@ def save_checkpoint(folder: Path, state: TrainState, run: str) -> None:
 
 
 def _identity(config: TrainConfig, start: ShapePrior | None) -> str:
-    """What a run must have in common with its checkpoint."""
+    """Settings and start of a run, which its checkpoint must share."""
     return json.dumps(asdict(config) | {"start": start and fingerprint(start)})
 
 

@@ -35,9 +35,9 @@ def save_prior(path: str | os.PathLike[str], prior: ShapePrior, card: dict[str, 
 
     Args:
         path: The file to write, `.safetensors`.
-        prior: What to write; the parameters are a tree of dictionaries. The kind of its model is
-            written beside them.
-        card: The model card, anything that JSON can hold.
+        prior: The shape prior to write; its parameters are a tree of dictionaries. The kind of its
+            model is written beside them.
+        card: The model card: a dictionary of anything that JSON can hold.
     """
     tensors = {name: _half(np.asarray(x)) for name, x in flatten(prior.params).items()}
     tensors["code_mean"] = np.asarray(prior.code_mean, np.float32)
@@ -56,11 +56,11 @@ def _half(x: np.ndarray) -> np.ndarray:
 def load_prior(
     path: str | os.PathLike[str] | None = None, model: ShapeModel | None = None
 ) -> ShapePrior:
-    """Read a shape prior; without a path, the one for chairs that comes with the package.
+    """Read a shape prior; without a path, the one for chairs that comes with the package. [host]
 
     Args:
-        path: A file written by `save_prior` or `jaxshape train`.
-        model: Your own model, for weights of its kind. The package's models need not be named.
+        path: A file written by `save_prior` or `jaxshape train`; None for the package's chairs.
+        model: Your own model, for weights of its kind; None for weights of the package's models.
 
     Raises:
         WeightsError: The file is missing, damaged, not in this format, or of a kind of model that
@@ -87,7 +87,11 @@ def _model(kind: str, given: ShapeModel | None, path: Path) -> ShapeModel:
 
 
 def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
-    """Read the model card of a weights file: data, command, seed, time, measured figures."""
+    """Read the model card of a weights file: data, command, seed, time, measured figures. [host]
+
+    Args:
+        path: A weights file; None for the package's chairs.
+    """
     return json.loads(_read(_path(path))[1]["card"])
 
 
@@ -158,7 +162,7 @@ def _check(model: ShapeModel, params: PyTree, mean, covariance, path: Path) -> N
 
 
 def _wrong_shape(model: ShapeModel, params: PyTree) -> str | None:
-    """What is wrong with the shapes of the parameters, in a few words."""
+    """A few words on the first parameter of a wrong shape; None where all are right."""
     if model.shapes is None:
         return None
     try:
@@ -174,7 +178,7 @@ def _wrong_shape(model: ShapeModel, params: PyTree) -> str | None:
 
 
 def _wrong_statistics(model: ShapeModel, params: PyTree, mean, covariance) -> str | None:
-    """What is wrong with the shapes of the codes' statistics, in a few words."""
+    """A few words on statistics of a wrong shape; None where all are right."""
     if mean is None or covariance is None:
         return "the codes' mean or covariance is missing"
     if mean.ndim != 1 or covariance.shape != mean.shape * 2:

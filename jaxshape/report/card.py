@@ -39,8 +39,14 @@ def training_card(
 ) -> dict[str, Any]:
     """The card of a finished run.
 
-    `data` is what the dataset says of itself, with its `source` and the number of objects `used`;
-    `start` the weights it began with, whose own samples are counted under `samples_before`.
+    Args:
+        config: Settings of the run.
+        metrics: Reports of the run.
+        data: Description of the dataset, with its `source` and the number of objects `used`.
+        start: Weights that the run began with, whose own samples are counted under
+            `samples_before`; None for random ones.
+        command: The command that started the run.
+        licence: Licence of the weights.
     """
     before = weights.load_card(start) if start else {}
     return basis_card(config, data, command=command, licence=licence) | {
@@ -184,8 +190,8 @@ meshes are in evaluation.json."""
 def _limits(card: dict[str, Any], scores: dict[str, Any] | None) -> Iterator[str]:
     yield (
         "Knows objects like those it was trained on and no others: upright, front along +z, each "
-        "axis scaled\n  to fill the grid up to a voxel on each side. What is thinner than a voxel merges with what is "
-        "beside it."
+        "axis scaled\n  to fill the grid up to a voxel on each side. What is thinner than a voxel "
+        "merges with what is beside it."
     )
     if scores is not None:
         yield (

@@ -29,10 +29,18 @@ _FRUSTUM = 0.12  # length of a drawn camera, in radii of the scene
 
 
 class Picture(NamedTuple):
+    """A picture of the report.
+
+    Attributes:
+        title: Text above the picture.
+        uri: The picture as a data URI.
+        description: Text for those who cannot see it.
+        note: Text below the picture.
+    """
+
     title: str
     uri: str
     description: str
-    """For those who cannot see it."""
     note: str = ""
 
 
@@ -40,7 +48,7 @@ class Picture(NamedTuple):
 
 
 def scene(found: ResultFolder) -> dict[str, Any]:
-    """What page.js draws: layers in the object frame, and where to look.
+    """The scene that page.js draws: layers in the object frame, and the view.
 
     Numbers travel as base64 of their little-endian bytes; grids as bits, 4 KiB each, of which the
     page makes cubes itself.

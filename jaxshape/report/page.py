@@ -25,10 +25,19 @@ KEYFRAMES_TO_SHOW = 12
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` of a result folder into it, from what the folder holds; returns its path.
+    """Write `report.html` of a result folder into it, from what the folder holds. [host]
 
     Sections of what is missing are left out, and files that cannot be read are named among the
-    warnings. All text that comes from the folder is escaped. `ValueError` for no folder.
+    warnings. All text that comes from the folder is escaped.
+
+    Args:
+        folder: Folder of a result, from `jaxshape demo` or `jaxshape reconstruct`, finished or not.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        ValueError: There is no such folder.
     """
     found = read_folder(folder)
     script = _beside("page.js")

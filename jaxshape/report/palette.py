@@ -12,7 +12,7 @@ FOG, PALE = "#B4BBC2", "#F1F3F4"
 CYCLE = (BLUE, ORANGE, GREEN, PINK, SKY, RED)
 
 COLORS = {"measured": BLUE, "predicted": ORANGE, "truth": GREEN, "occluded": FOG}
-"""Of voxels and meshes."""
+"""Colours of voxels and meshes."""
 
 STATUS_COLORS = {
     "keyframe": BLUE,
@@ -20,15 +20,15 @@ STATUS_COLORS = {
     "lost": RED,
     "unreadable": PINK,
 }
-"""Of the frames of a recording, by what became of them."""
+"""Colours of the frames of a recording, by status."""
 
 
 class Layer(NamedTuple):
-    """How one thing of a scene in 3D is called and drawn.
+    """Name and look of one part of a scene in 3D.
 
     Attributes:
-        label: For people.
-        color: As `#rrggbb`.
+        label: Text that names the layer.
+        color: Colour as `#rrggbb`.
         shown: Whether it is shown at first.
     """
 

@@ -87,8 +87,8 @@ def write_overview(
 
     Args:
         folder: The result folder.
-        observation: What was measured of the object.
-        reconstruction: What was found, a batch of one.
+        observation: Measurement of the object.
+        reconstruction: The reconstruction, a batch of one.
         result: The content of result.json; its IoUs are noted below the grids.
     """
     one = only(reconstruction)

@@ -140,7 +140,7 @@ def _face_shade(
 def _corner_crowding(
     occupied: Bool[np.ndarray, "x y z"], cells: Integer[np.ndarray, "n 3"], axis: int, sign: int
 ) -> Integer[np.ndarray, "n 4"]:
-    """How many of the three voxels in front of a face, around each of its corners, are filled.
+    """Number of filled voxels, of three, in front of a face around each of its corners.
 
     The usual cheap ambient occlusion of voxel games; two filled sides hide the third voxel.
     """

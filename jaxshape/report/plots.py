@@ -16,13 +16,19 @@ SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def plot_search(path: str | Path, search: Search) -> None:
-    """Plot one search over the objectives it evaluated: a panel for each thing its trace tells.
+    """Plot one search over the objectives it evaluated: a panel for each part of its trace.
 
-    The distance of the losses to the lowest of all (gaps are the lowest itself); step size and
-    ratio of the axes; the standard deviation of every coordinate; the lengths of the principal
-    axes. Without a distribution, the spread of the candidates takes the place of the last three.
-    Dashed lines are restarts. ValueError for a suffix that is no format of pictures and for a
-    search that ended before its first iteration.
+    The panels are: the distance of the losses to the lowest of all (gaps are the lowest itself);
+    step size and ratio of the axes; the standard deviation of every coordinate; the lengths of the
+    principal axes. Without a distribution, the spread of the candidates takes the place of the last
+    three. Dashed lines are restarts.
+
+    Args:
+        path: The picture to write, `.png`, `.svg` or `.pdf`.
+        search: The search.
+
+    Raises:
+        ValueError: The suffix is another one, or the search ended before its first iteration.
     """
     trace = search.trace
     evaluations, normal = trace.evaluations, trace.distribution
@@ -56,7 +62,15 @@ def plot_search(path: str | Path, search: Search) -> None:
 
 
 def compare_searches(path: str | Path, searches: Sequence[Search]) -> None:
-    """Plot the lowest loss so far of several searches over the objectives they evaluated."""
+    """Plot the lowest loss so far of several searches over the objectives they evaluated.
+
+    Args:
+        path: The picture to write, `.png`, `.svg` or `.pdf`.
+        searches: The searches, one or more.
+
+    Raises:
+        ValueError: The suffix is another one, or a search ended before its first iteration.
+    """
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()

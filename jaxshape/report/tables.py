@@ -47,7 +47,7 @@ ABOUT_COLUMNS = (
 
 
 def keyframe_table(keyframes: Sequence[KeyframeRecord]) -> str:
-    """What is known of each keyframe; columns of which nothing is known are left out."""
+    """A table of the figures of each keyframe; columns without any figure are left out."""
     cells = {
         column.heading: [
             number(k.figures.get(column.figure), column.digits, times=column.times)

@@ -75,7 +75,7 @@ class LiveView:
     # -------------------------------------------------------------- the panel
 
     def _panel(self) -> None:
-        """What stands beside the picture: figures, layers to show, keyframes."""
+        """Build the panel beside the picture: figures, layers to show, keyframes."""
         gui = self.server.gui
         # Sharing would send the scene through a machine elsewhere.
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -201,7 +201,7 @@ def _html(lines: list[str]) -> str:
 
 
 def _nodes(scene: viser.SceneApi, found: ResultFolder) -> dict[str, tuple[bytes, Draw]]:
-    """By name: what tells whether a node is still the same, and how to draw it."""
+    """Nodes by name: the bytes that identify the content of each, and how to draw it."""
     nodes: dict[str, tuple[bytes, Draw]] = {}
     mesh, path = mesh_in_object(found), found.trajectory
     if mesh is not None:

@@ -34,7 +34,13 @@ STATE = "state.npz"
 
 
 def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> None:
-    """Keep what a later run with the same settings needs to go on from here."""
+    """Keep what a later run with the same settings needs to go on from here.
+
+    Args:
+        folder: The result folder.
+        progress: Progress of the run.
+        settings: Settings of the run, as JSON can hold them.
+    """
     state, start = progress.state, progress.start
     arrays: dict[str, Any] = {
         "about": json.dumps(
@@ -88,9 +94,20 @@ def load_state(
     *,
     isotropic: bool,
 ) -> Progress | None:
-    """The progress of a run that was cut short; None where there is none.
+    """The progress of a run that was cut short.
 
-    Raises `SequenceError` where that run had other settings, or the file is not what it should be.
+    Args:
+        folder: The result folder.
+        sequence: The recording of the run.
+        prior: The shape prior of the run.
+        settings: Settings of the run, as given to `save_state`.
+        isotropic: Whether all axes of the grid have one scale.
+
+    Returns:
+        The progress; None where there is none.
+
+    Raises:
+        SequenceError: That run had other settings, or the file is damaged.
     """
     path = folder / STATE
     if not path.is_file():

@@ -32,16 +32,22 @@ OBJECTS_AT_A_TIME = 16
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """What decides the figures of an evaluation, besides the meshes and the weights."""
+    """Settings of an evaluation, besides the meshes and the weights.
+
+    Attributes:
+        frames: Numbers of frames to fuse, each 1 or more: the first k of the orbit.
+        methods: Names of the searches, see `jaxshape.search.methods`; "encoder" searches nothing.
+        noise: Add the faults of a real sensor to the depth images.
+        ceiling: Add to the bounds the best that the space could hold, `fit_surface`, whatever was
+            seen.
+        refine: Settings of the searches.
+        seed: Seed of noise, surface samples and searches, 0 or more.
+    """
 
     frames: tuple[int, ...] = (1, 4, 8, 18)
-    """Numbers of frames to fuse: the first k of the orbit."""
     methods: tuple[str, ...] = ("encoder", "gradient", "cma")
-    """By name, see `jaxshape.search.methods`; "encoder" searches nothing."""
     noise: bool = False
-    """Add the faults of a real sensor to the depth images."""
     ceiling: bool = False
-    """Add to the bounds the best that the space could hold, `fit_surface`, whatever was seen."""
     refine: RefineConfig = field(default_factory=RefineConfig)
     seed: int = 0
 
@@ -50,7 +56,13 @@ NOTHING = "No pixel of some number of frames meets the mesh: it is too thin for 
 
 
 class Case(NamedTuple):
-    """One object after one number of frames; batched over both."""
+    """One object after one number of frames; batched over both.
+
+    Attributes:
+        occupied: F `[*case x y z]`.
+        occluded: M `[*case x y z]`.
+        surface: True surface voxels `[*case x y z]`.
+    """
 
     occupied: Bool[Array, "*case x y z"]
     occluded: Bool[Array, "*case x y z"]
@@ -58,9 +70,15 @@ class Case(NamedTuple):
 
 
 def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) -> Case | None:
-    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k asked for.
+    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k of the settings.
 
-    None where some number of frames measured nothing.
+    Args:
+        model: The mesh.
+        config: Settings of the evaluation.
+        resolution: Voxels along each axis of the grids.
+
+    Returns:
+        The grids; None where some number of frames measured nothing.
     """
     mesh = model.mesh
     # Independent of the other meshes, so that a mesh scores the same in any company.
@@ -79,12 +97,19 @@ def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) 
 def evaluate(
     prior: ShapePrior, models: Sequence[Model], config: EvaluateConfig
 ) -> Iterator[dict[str, Any] | Skipped]:
-    """Yield the scores of each mesh in turn, as they go under `per_mesh` into the results file.
+    """Score each mesh in turn.
 
-    A mesh of which nothing was measured is yielded as skipped.
+    Meshes are refined in batches; the last batch is filled up with its own first cases so that one
+    compiled program serves all.
 
-    Meshes are refined in batches; the last batch is filled up with its own first cases so that
-    one compiled program serves all.
+    Args:
+        prior: The shape prior.
+        models: The meshes.
+        config: Settings of the evaluation.
+
+    Yields:
+        The scores of each mesh, as they go under `per_mesh` into the results file; a mesh of which
+        nothing was measured is `Skipped`.
     """
     run, fit = by_each_method(prior, config), jax.jit(fit_surface)
     group = max(1, OBJECTS_AT_A_TIME // len(config.frames))
@@ -123,10 +148,17 @@ def evaluate(
 def by_each_method(
     prior: ShapePrior, config: EvaluateConfig
 ) -> Callable[..., dict[str, Reconstruction]]:
-    """A compiled `reconstruct` by every method; ValueError for a name that is none.
+    """A compiled `reconstruct` by every method.
 
-    In one program, where XLA computes only once what the methods have in common: the first code,
-    its decoded shape and the target.
+    All methods are in one program, where XLA computes only once what they have in common: the first
+    code, its decoded shape and the target.
+
+    Args:
+        prior: The shape prior.
+        config: Settings of the evaluation.
+
+    Raises:
+        ValueError: There is no such method.
     """
     refiners = {name: refiner_for(name, prior, config.refine) for name in config.methods}
 

@@ -1,4 +1,4 @@
-"""What a result folder holds, whatever of it is there, for the report and the viewer. [host]
+"""The content of a result folder, as far as it is there, for the report and the viewer. [host]
 
 A folder may be old, half written, or rewritten at this moment: a file that is missing is left out,
 and of one that cannot be read, `problems` tells.
@@ -19,47 +19,66 @@ IMAGES = ("image", "depth", "mask")
 
 
 class KeyframeRecord(NamedTuple):
-    """A fused frame; `None` for what is not known of it."""
+    """A fused frame of a result folder.
+
+    Attributes:
+        name: Name of the frame.
+        T_world_camera: Pose of the frame `[4 4]`; None where it is not known.
+        files: Files of its image, depth and mask that are there.
+        figures: All entries of keyframes.json for the frame.
+    """
 
     name: str
     T_world_camera: Float[np.ndarray, "4 4"] | None
     files: dict[str, Path]
-    """Those of its image, depth and mask that are there."""
     figures: dict[str, Any]
-    """All that keyframes.json says of it."""
 
 
 class ResultFolder(NamedTuple):
-    """The content of a result folder; what is missing is empty or `None`."""
+    """The content of a result folder; missing parts are empty or None.
+
+    Attributes:
+        name: Name of the folder.
+        result: Content of result.json.
+        mesh: Mesh in the world frame, in metres.
+        grids: Grids of `GRIDS` that are there.
+        origin: Object-frame position of voxel coordinate (0, 0, 0), in metres.
+        voxel_size: Edge lengths of one voxel, in metres.
+        T_object_world: World to object frame `[4 4]`.
+        intrinsics: fx, fy, cx, cy of the frames, in pixels.
+        shape: Height and width of the frames, in pixels.
+        keyframes: The keyframes, in their order.
+        frames: Index, name, status and reason of every frame of the recording.
+        trajectory: Segments of the camera's path in the object frame `[s 2 3]`, in metres.
+        problems: A sentence for each file that cannot be read.
+    """
 
     name: str
     result: dict[str, Any]
-    """The content of result.json."""
     mesh: trimesh.Trimesh | None
-    """In the world frame, metres."""
     grids: dict[str, Bool[np.ndarray, "x y z"]]
-    """Those of `GRIDS` that are there."""
     origin: Float[np.ndarray, " 3"]
     voxel_size: Float[np.ndarray, " 3"]
     T_object_world: Float[np.ndarray, "4 4"]
     intrinsics: tuple[float, float, float, float] | None
-    """fx, fy, cx, cy in pixels."""
     shape: tuple[int, int] | None
-    """Height and width of the frames."""
     keyframes: list[KeyframeRecord]
     frames: list[dict[str, Any]]
-    """Index, name, status and reason of every frame of the recording."""
     trajectory: Float[np.ndarray, "s 2 3"]
-    """Segments of the camera's path in the object frame, metres."""
     problems: list[str]
-    """A sentence for each file that cannot be read."""
 
 
 def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
-    """Read what is there of a folder made by `demo` or `reconstruct`, finished or not.
+    """Read a folder made by `demo` or `reconstruct`, finished or not, as far as it is there.
 
-    Without a grid the object frame is not known; the first keyframe's, turned upright, stands in.
-    `ValueError` where there is no such folder.
+    Without a grid the object frame is not known; the frame of the first keyframe, turned upright,
+    takes its place.
+
+    Args:
+        folder: The result folder.
+
+    Raises:
+        ValueError: There is no such folder.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -12,9 +12,9 @@ class Journal:
 
     Attributes:
         path: The file.
-        settings: What the rows were made under, as JSON has it.
-        rows: By name, in the order in which they came.
-        seconds: What they took together, over all runs.
+        settings: Settings under which the rows were made, as JSON holds them.
+        rows: Rows by name, in the order in which they came.
+        seconds: Time that all rows took, over all runs.
     """
 
     def __init__(self, path: Path, settings: dict[str, Any]):

@@ -1,4 +1,4 @@
-"""How far a predicted grid or surface is from the true one: IoU, Chamfer-L1, F-score."""
+"""Agreement of a predicted grid or surface with the true one: IoU, Chamfer-L1, F-score. [host]"""
 
 from typing import NamedTuple
 
@@ -17,12 +17,16 @@ finite and a method cannot gain by predicting nothing."""
 
 
 class Bounds(NamedTuple):
-    """IoU of the measurements alone, with two ways to fill in what they did not see."""
+    """IoU of the measurements alone, with two ways to fill in the occluded voxels; leading axes are
+    batch axes.
+
+    Attributes:
+        occluded_empty: IoU, from 0 to 1, with every occluded voxel taken as free `[*batch]`.
+        occluded_full: IoU, from 0 to 1, with every occluded voxel taken as occupied `[*batch]`.
+    """
 
     occluded_empty: Float[Array, "..."]
-    """Every occluded voxel taken as free."""
     occluded_full: Float[Array, "..."]
-    """Every occluded voxel taken as occupied."""
 
 
 def bounds(
@@ -30,9 +34,15 @@ def bounds(
     occluded: Bool[Array | np.ndarray, "*#batch x y z"],
     truth: Bool[Array | np.ndarray, "*#batch x y z"],
 ) -> Bounds:
-    """Return the IoU of F with all occluded voxels set to empty, and to full.
+    """IoU of F with all occluded voxels set to empty, and to full.
 
-    The two curves the paper draws as bounds; either can come out higher.
+    These are the two curves that the paper draws as bounds (section 4.1); either can be the higher
+    one.
+
+    Args:
+        occupied: F `[*batch x y z]`, binary. Leading axes broadcast.
+        occluded: M `[*batch x y z]`, binary.
+        truth: True surface voxels `[*batch x y z]`.
     """
     return Bounds(iou(occupied & ~occluded, truth), iou(occupied | occluded, truth))
 
@@ -40,12 +50,20 @@ def bounds(
 def chamfer_l1(
     points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "m 3"], diagonal: float
 ) -> float:
-    """Chamfer-L1 distance of two point sets, as a fraction of a bounding-box diagonal.
+    """Chamfer-L1 distance of two point sets, as a fraction of a bounding-box diagonal. [host]
 
-    The mean distance from a point of one set to the nearest of the other, not squared, averaged
-    over the two directions and divided by `diagonal`, which is that of the true shape in the
-    units of the points. 0.01 reads: surfaces are 1 % of the diagonal apart on average. Both sets
-    empty: 0; one empty: 1.
+    It is the mean distance from a point of one set to the nearest of the other, not squared,
+    averaged over the two directions and divided by the diagonal. 0.01 means that surfaces are 1 %
+    of the diagonal apart on average.
+
+    Args:
+        points_a: Points of one set `[n 3]`, in any unit.
+        points_b: Points of the other set `[m 3]`, in the same unit.
+        diagonal: Diagonal of the bounding box of the true shape, above 0, in the unit of the
+            points.
+
+    Returns:
+        A number from 0; 0 where both sets are empty, 1 where one is.
     """
     if not len(points_a) or not len(points_b):
         return 0.0 if len(points_a) == len(points_b) else WORST_CHAMFER
@@ -56,11 +74,16 @@ def chamfer_l1(
 def f_score(
     points_a: Float[np.ndarray, "n 3"], points_b: Float[np.ndarray, "m 3"], threshold: float
 ) -> float:
-    """Harmonic mean of the two fractions of points nearer than `threshold` to the other set.
+    """Harmonic mean of the two fractions of points that lie near the other set. [host]
 
-    Between 0 and 1. `threshold` is in the units of the points: 0.01 where the grid's cube (the
-    whole grid, not the object in it) has side 1. A distance equal to the threshold counts as
-    near. 0 where both fractions are 0, or a set is empty.
+    Args:
+        points_a: Points of one set `[n 3]`, in any unit.
+        points_b: Points of the other set `[m 3]`, in the same unit.
+        threshold: Distance up to which a point is near, itself included, in the unit of the points:
+            0.01 where the grid's cube (the whole grid, not the object in it) has side 1.
+
+    Returns:
+        A number from 0 to 1; 0 where both fractions are 0, or a set is empty.
     """
     if not len(points_a) or not len(points_b):
         return 0.0
@@ -80,26 +103,38 @@ def _nearest_distances(
 
 
 class ShapeScores(NamedTuple):
-    """Agreement of two grids."""
+    """Agreement of two grids.
+
+    Attributes:
+        iou: Intersection over union of the voxels, from 0 to 1; higher is better.
+        chamfer_l1: Chamfer-L1 distance as a fraction of the diagonal of the true surface's bounding
+            box, in grid units, from 0; lower is better.
+        f_score: F-score at 1 % of the grid's side, from 0 to 1; higher is better.
+    """
 
     iou: float
-    """Intersection over union of the voxels; higher is better."""
     chamfer_l1: float
-    """Fraction of the true surface's bounding-box diagonal, in grid units; lower is better."""
     f_score: float
-    """At 1 % of the grid's side; higher is better."""
 
 
 def shape_scores(
     predicted: Bool[Array | np.ndarray, "x y z"], truth: Bool[Array | np.ndarray, "x y z"]
 ) -> ShapeScores:
-    """Score one predicted grid against the true one, in units of the grid's cube.
+    """Score one predicted grid against the true one, in units of the grid's cube. [host]
 
-    The point sets are `boundary_points`, so equal grids score 0 and 1 with no sampling noise.
-    Nothing else on 32 voxels lies within 1 % of the cube, a third of a voxel: the F-score says
-    what part of the voxels' surface is exactly right. A grid's axes each have their own scale,
-    so distances are those of the cube, not metres. An empty prediction of a shape scores the
-    worst values: IoU 0, Chamfer 1, F-score 0. Two empty grids: 1, 0, 0.
+    The point sets are centres of the voxel faces between occupied and free (`boundary_points`), so
+    that equal grids score 0 and 1 without sampling noise. With 32 voxels along an axis nothing else
+    lies within 1 % of the cube, a third of a voxel: the F-score is the share of the voxels' surface
+    that is exactly right. A grid's axes each have their own scale, so distances are those of the
+    cube, not metres.
+
+    Args:
+        predicted: Occupied voxels of the prediction `[x y z]`.
+        truth: Occupied voxels of the true shape `[x y z]`.
+
+    Returns:
+        The scores. An empty prediction of a shape has the worst values, IoU 0, Chamfer 1, F-score
+        0; two empty grids have 1, 0, 0.
     """
     points, true_points = boundary_points(predicted), boundary_points(truth)
     diagonal = float(np.linalg.norm(np.ptp(true_points, axis=0))) if len(true_points) else 1.0

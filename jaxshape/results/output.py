@@ -22,15 +22,15 @@ SMOOTHING = 20
 
 
 class Observation(NamedTuple):
-    """What was measured of one object, and where its grid lies.
+    """Measurement of one object, and the place of its grid.
 
     Attributes:
-        depth: A few depth frames to show, in metres.
-        occupied: F.
-        occluded: M.
-        frame: Of the grid, in the object frame.
-        T_world_object: The object's pose.
-        truth: The complete surface, where it is known.
+        depth: Some depth images to show, in metres.
+        occupied: F `[x y z]`, binary.
+        occluded: M `[x y z]`, binary.
+        frame: Voxel frame of the grid, in the object frame.
+        T_world_object: Pose of the object `[4 4]`.
+        truth: Complete surface of the object `[x y z]`; None where it is not known.
     """
 
     depth: Sequence[Float[np.ndarray, "_ _"]]
@@ -51,9 +51,9 @@ def write_result(
 
     Args:
         folder: Where to write; made if missing.
-        observation: What was measured of the object.
-        reconstruction: What was found, a batch of one.
-        figures: What `result.json` holds besides, such as the settings.
+        observation: Measurement of the object.
+        reconstruction: The reconstruction, a batch of one.
+        figures: Further entries of `result.json`, such as the settings.
 
     Returns:
         The content of `result.json`: `figures`, the objective before and after in nats per voxel,

@@ -1,4 +1,4 @@
-"""What the reconstruction of a recording leaves on disk, while it runs and when it ends. [host]
+"""Files of the reconstruction of a recording, while it runs and when it ends. [host]
 
     keyframes/       pictures of the keyframes
     keyframes.json   the camera, the keyframes and what became of every frame
@@ -37,7 +37,19 @@ def write_progress(
     *,
     running: bool,
 ) -> dict[str, Any]:
-    """Write all but the checkpoint, as far as there is something; returns result.json."""
+    """Write all files of a reconstruction but the checkpoint, as far as there is something.
+
+    Args:
+        folder: The result folder.
+        sequence: The recording.
+        progress: Progress of the run.
+        figures: Further entries of `result.json`.
+        min_hits: Depth points that make a voxel occupied.
+        running: Whether the run goes on.
+
+    Returns:
+        Content of `result.json`.
+    """
     _write_pictures(folder / "keyframes", sequence, progress)
     _write_trajectory(folder, sequence, progress)
     observation = observation_of(progress.state, min_hits)
@@ -57,7 +69,7 @@ def write_progress(
 
 
 def observation_of(state: MapState, min_hits: int) -> Observation:
-    """What the keyframes of a map measured of the object."""
+    """Measurement of the object by the keyframes of a map."""
     every = max(1, len(state.keyframes) // FRAMES_TO_SHOW)
     shown = state.keyframes[::every][:FRAMES_TO_SHOW]
     return Observation(
@@ -71,7 +83,7 @@ def observation_of(state: MapState, min_hits: int) -> Observation:
 
 
 def counts(progress: Progress) -> dict[str, int]:
-    """How many frames there were, and what became of them."""
+    """Numbers of frames, in all and by status."""
     statuses = [log.status for log in progress.logs]
     return {
         "frames": len(statuses),
@@ -95,7 +107,7 @@ def _crop(depth: np.ndarray, segmented: np.ndarray) -> np.ndarray:
 
 
 def _fused(progress: Progress) -> Iterator[tuple[FrameLog, Keyframe]]:
-    """What became of each keyframe, and what the map keeps of it."""
+    """The log of each keyframe, and the keyframe as the map keeps it."""
     logs = (log for log in progress.logs if log.status == "keyframe")
     return zip(logs, progress.state.keyframes, strict=True)
 

@@ -1,4 +1,4 @@
-"""What a result comes to, in words and figures with units, for the report and the viewer. [host]"""
+"""A result in words and in figures with units, for the report and the viewer. [host]"""
 
 import math
 from collections import Counter
@@ -9,9 +9,16 @@ from jaxshape.results.folder import KeyframeRecord, ResultFolder
 
 
 class Figure(NamedTuple):
+    """A figure of a result, in words.
+
+    Attributes:
+        name: Name of the figure.
+        value: Its value, with a unit.
+        meaning: What the value means, in words.
+    """
+
     name: str
     value: str
-    """With its unit."""
     meaning: str
 
 
@@ -43,7 +50,7 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
 
 
 def warnings_of(found: ResultFolder) -> list[str]:
-    """What the reconstruction warns of, frames that are not used, and files that are damaged."""
+    """Warnings of a result: its own, frames that are not used, and files that are damaged."""
     given, counts = found.result.get("warnings") or [], _counts(found)
     unused = [
         f"{counts[status]} of {len(found.frames)} frames were {status}, and are not fused."
@@ -54,7 +61,7 @@ def warnings_of(found: ResultFolder) -> list[str]:
 
 
 def _minimised(result: dict[str, Any]) -> str:
-    """What the search minimised, in words."""
+    """The objective of the search, in words."""
     search = result.get("search")
     name = str(search["objective"]) if isinstance(search, dict) and "objective" in search else ""
     words = {
@@ -66,7 +73,7 @@ def _minimised(result: dict[str, Any]) -> str:
 
 
 def tracked(keyframe: KeyframeRecord) -> str:
-    """How well a keyframe's pose is known."""
+    """Figures of the registration of a keyframe, in words."""
     inliers, rmse = keyframe.figures.get("inlier_fraction"), keyframe.figures.get("rmse")
     agree = number(inliers, 0, times=100.0, unit=" % inliers")
     return ", ".join(filter(None, (agree, number(rmse, 1, times=1000.0, unit=" mm"))))

@@ -22,18 +22,28 @@ def surface(
     smoothing: int = 0,
     T_world_object: Float[Array | np.ndarray, "4 4"] | None = None,
 ) -> trimesh.Trimesh:
-    """Return the closed surface around the voxels more probable than `level`, in metres.
+    """The closed surface around the voxels more probable than a level, in metres. [host]
 
-    Marching cubes between voxel centres (at +0.5), with free space all around the grid, mapped
-    through `frame` to the object frame and, if given, by the rigid `T_world_object` to the world.
-    Normals point from occupied to free. Occupancy is a shell around what may be hollow, so the
-    mesh has outer sheets and, round a cavity, inner ones whose normals point into the cavity: the
+    Marching cubes runs between voxel centres (at +0.5), with free space all around the grid.
+    Normals point from occupied to free. Occupancy is a shell around what may be hollow, so the mesh
+    has outer sheets and, around a cavity, inner ones whose normals point into the cavity: the
     signed volume is that of the shell alone, and positive.
 
-    `smoothing` rounds of Taubin's filter take the staircase off a boolean grid, about 20 being
-    enough; unlike a blur of the grid they cannot lose a leg one voxel thin.
+    Args:
+        probability: Probability of each voxel `[x y z]`, from 0 to 1, or booleans.
+        frame: Voxel frame of the grid, which maps it to the object frame.
+        level: Probability at the surface, between 0 and 1.
+        smoothing: Rounds of Taubin's filter, 0 or more, that take the staircase off a boolean grid;
+            about 20 are enough. Unlike a blur of the grid they cannot lose a leg one voxel thin.
+        T_world_object: Rigid motion from the object frame to the world `[4 4]`; None leaves the
+            mesh in the object frame.
 
-    Raises `ValueError` for a grid with nothing above `level`, or with values that are not finite.
+    Returns:
+        A closed triangle mesh whose vertices are in metres.
+
+    Raises:
+        ValueError: No voxel is above the level, values are not finite, or the level is outside (0,
+            1).
     """
     mesh = voxel_surface(probability, level=level)
     if smoothing:
@@ -49,7 +59,7 @@ def voxel_surface(
     *,
     level: float = 0.5,
 ) -> trimesh.Trimesh:
-    """Return the closed surface at `level` in voxel coordinates; see `surface`."""
+    """The closed surface at a level, in voxel coordinates; see `surface`."""
     values = np.asarray(probability, np.float64)
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, but is {level}.")
@@ -73,10 +83,14 @@ def voxel_surface(
 
 
 def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
-    """Write a mesh as PLY, GLB or OBJ, whichever the suffix of `path` names.
+    """Write a mesh as PLY, GLB or OBJ; an earlier file is replaced only by a complete one. [host]
 
-    What was at `path` is replaced only once the new file is complete. Raises `ValueError` for
-    another suffix.
+    Args:
+        mesh: The mesh to write.
+        path: The file to write; its suffix names the format, `.ply`, `.glb` or `.obj`.
+
+    Raises:
+        ValueError: The suffix is another one.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in MESH_SUFFIXES:

@@ -18,14 +18,17 @@ class TraceError(ValueError):
 
 
 class Search(NamedTuple):
-    """One search as its result folder tells of it."""
+    """One search of a result folder.
+
+    Attributes:
+        name: Name of the folder.
+        trace: Trace of the search, NumPy arrays with one row per iteration.
+        result: Content of result.json.
+    """
 
     name: str
-    """Of the folder."""
     trace: Trace
-    """NumPy arrays with one row per iteration."""
     result: dict[str, Any]
-    """The content of result.json."""
 
 
 def write_trace(path: str | os.PathLike[str], trace: Trace) -> None:
@@ -38,7 +41,14 @@ def write_trace(path: str | os.PathLike[str], trace: Trace) -> None:
 
 
 def read_trace(path: str | os.PathLike[str]) -> Trace:
-    """Read what `write_trace` wrote; `TraceError` for a file that is something else."""
+    """Read what `write_trace` wrote.
+
+    Args:
+        path: The file to read.
+
+    Raises:
+        TraceError: The file is something else.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -51,8 +61,12 @@ def read_trace(path: str | os.PathLike[str]) -> Trace:
 def read_search(folder: str | os.PathLike[str]) -> Search:
     """Read the search of a folder made by `jaxshape reconstruct` or `jaxshape demo`.
 
-    `TraceError` where the folder is none of these, was made before traces were kept, or holds the
-    encoder's answer, for which nothing was searched.
+    Args:
+        folder: The result folder.
+
+    Raises:
+        TraceError: The folder is no result folder, was made before traces were kept, or holds the
+            encoder's answer, for which nothing was searched.
     """
     folder = Path(folder)
     if not (folder / "result.json").is_file():

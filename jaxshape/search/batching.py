@@ -1,4 +1,4 @@
-"""Choices by a traced truth: between trees, and branches that stay branches under `jax.vmap`."""
+"""Choices by a traced boolean: between trees, and branches that stay branches under `jax.vmap`."""
 
 from collections.abc import Callable
 from typing import Any

@@ -35,17 +35,18 @@ class CmaState(NamedTuple):
     """The distribution N(mean, sigma^2 C) of one search, and its best candidate.
 
     Attributes:
-        mean: Centre of the distribution.
+        mean: Centre of the distribution `[d]`.
         best: The best candidate so far, the start included where its loss was given.
-        stop: Why the search ended, a `StopReason`; RUNNING as long as it goes on.
-        sigma: Step size.
-        covariance: C, symmetric and positive definite.
-        basis: B, eigenvectors of C as columns, as of the last decomposition.
-        scales: D, roots of the eigenvalues of C, ascending, as of the last decomposition.
-        path_sigma: p_sigma, the evolution path of the step size.
-        path_c: p_c, the evolution path of the covariance.
-        generation: How many generations the distribution has seen.
-        history: What the stop criteria remember.
+        stop: Why the search ended, as a `StopReason`; RUNNING while it goes on.
+        sigma: Step size, the scale that all axes share; above 0.
+        covariance: C `[d d]`, symmetric and positive definite.
+        basis: B `[d d]`, eigenvectors of C as columns, as of the last decomposition.
+        scales: D `[d]`, square roots of the eigenvalues of C, ascending, as of the last
+            decomposition.
+        path_sigma: p_sigma `[d]`, the evolution path of the step size.
+        path_c: p_c `[d]`, the evolution path of the covariance.
+        generation: Generations that the distribution has seen, from 0.
+        history: What the stop criteria remember of earlier generations.
     """
 
     mean: Float[Array, " d"]
@@ -62,7 +63,16 @@ class CmaState(NamedTuple):
 
 
 def checked_population(dim: int, sigma0: Float[Array, ""] | float, population: int | None) -> int:
-    """The population, once the settings make a search; `ValueError` where they do not."""
+    """Check the settings of a search, and give its population.
+
+    Args:
+        dim: Numbers in a point, 1 or more.
+        sigma0: First standard deviation, above 0.
+        population: Candidates per generation, 3 or more; None for pycma's default.
+
+    Raises:
+        ValueError: A setting is outside its range.
+    """
     whole("dim", dim, 1)
     if not is_array(sigma0):
         positive("sigma0", sigma0)
@@ -81,7 +91,7 @@ def cma_start(
 ) -> CmaState:
     """The distribution N(point, sigma0^2 I) before the first generation.
 
-    With `cma_ask` and `cma_tell` for an own loop, in JAX or around a simulator:
+    Use it with `cma_ask` and `cma_tell` in your own loop, in JAX or around a simulator:
 
     >>> import jax, jax.numpy as jnp, jaxshape as js
     >>> losses_of = jax.vmap(lambda x: jnp.sum((x - 3) ** 2))
@@ -94,11 +104,11 @@ def cma_start(
     Array([3., 3., 3., 3., 3.], dtype=float32)
 
     Args:
-        point: Centre of the distribution.
+        point: Centre of the distribution `[d]`.
         sigma0: Standard deviation of every coordinate, above 0.
-        population: Candidates per generation that the stop criteria of `stopping.check` reckon
-            with; None for pycma's 4 + floor(3 ln d).
-        loss: Of the point, where it is known; the point then counts as the best so far.
+        population: Candidates per generation, 3 or more, for the stop criteria of `stopping.check`;
+            None for pycma's 4 + floor(3 ln d).
+        loss: Loss of the point where it is known; the point then counts as the best so far.
 
     Returns:
         The state of a search that has seen no generation. Its `stop` stays RUNNING under
@@ -141,12 +151,12 @@ def start(
 
 
 def started(state: CmaState) -> tuple[CmaState, Trace]:
-    """A state that has evaluated one point, with its trace."""
+    """A state that has evaluated one point, together with its trace."""
     return state, start_trace(state.best, distribution(state))
 
 
 def distribution(state: CmaState) -> Distribution:
-    """What a reader plots of the distribution."""
+    """The distribution of a state, as a trace records it."""
     return Distribution(
         sigma=state.sigma,
         standard_deviations=state.sigma * jnp.sqrt(jnp.diag(state.covariance)),
@@ -177,11 +187,11 @@ def cma_ask(key: Array, state: CmaState, number: int) -> Float[Array, "{number} 
 
     Args:
         key: Random key of this generation.
-        state: The distribution.
-        number: How many candidates to draw; static under `jax.jit`.
+        state: The distribution to sample from.
+        number: Candidates to draw, 1 or more; static under `jax.jit`.
 
     Returns:
-        The candidates.
+        The candidates `[number d]`.
     """
     z = jax.random.normal(key, (number, len(state.mean)), state.mean.dtype)
     return state.mean + state.sigma * (z @ state.basis * state.scales) @ state.basis.T
@@ -201,13 +211,13 @@ def cma_tell(
     infinite losses rank last.
 
     Args:
-        state: The distribution before.
-        points: One generation, three candidates or more. They need not come from `cma_ask`.
-        losses: Their losses.
-        rates: Weights and learning rates; None for pycma's own (`jaxshape.search.cma.constants`).
+        state: The distribution before this generation.
+        points: Candidates of one generation `[n d]`, 3 or more. They need not come from `cma_ask`.
+        losses: Losses of these candidates `[n]`.
+        rates: Weights and learning rates (`jaxshape.search.cma.constants`); None for pycma's own.
 
     Returns:
-        The distribution after.
+        The distribution after this generation.
     """
     if rates is None:
         rates = constants(len(state.mean), len(points), dtype=state.mean.dtype)

@@ -1,4 +1,4 @@
-"""Settings of a search; free of JAX, so that the command line can show them at once."""
+"""Settings of a search. Nothing here imports JAX, so that the command line answers at once."""
 
 import math
 from dataclasses import dataclass
@@ -12,33 +12,36 @@ Space = Literal["whitened", "raw"]
 
 
 def is_array(value: Any) -> bool:
-    """Whether a setting is an array of JAX, which may be traced, so that its value is unknown."""
+    """Whether a setting is a JAX array, which may be traced, so that its value is not known."""
     return hasattr(value, "aval")
 
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """How a shape is searched for.
+    """Settings of a search for the shape of an object.
 
     Attributes:
-        objective: `paper` is Eq. 7 as printed; in `balanced` measured free space counts a third; in
-            `soft` each voxel counts by how sure its measurement is.
+        objective: The residual that is minimised: `paper` is Eq. 7 as printed; in `balanced`
+            measured free space counts a third; in `soft` each voxel counts by how sure its
+            measurement is.
         iterations: Steps of the search at most, 1 or more (paper: 350).
         population: Candidates per iteration of a population search, 3 or more (pycma's default for
             100 dimensions is 17).
         sigma0: First standard deviation of a population, above 0, in units of the search space.
-        step_size: Learning rate of gradient methods, above 0; the method's own where it is None.
+        step_size: Learning rate of gradient methods, above 0; None for the method's own.
         space: Coordinates of the search: `whitened`, in which the training codes have mean 0 and
             covariance I, or `raw`, the codes themselves (paper).
-        bound: The search keeps every coordinate within this distance of 0, in the whitened space
-            the mean code. Above 0, in units of the search space; None for no bounds.
-        prior_weight: Weight of the distribution of the training codes, 0 or more: 1 adds their
-            negative log-density to that of the voxels.
-        tolerance: The search stops where the objective of recent candidates differs by less than
-            this, in nats per voxel; 0 never stops it.
+        bound: The search keeps every coordinate within this distance of the centre, which is the
+            mean code in the whitened space and 0 in the raw one. Above 0, in units of the search
+            space; None for no bounds.
+        prior_weight: Weight of the codes' prior density, 0 or more: 1 adds the negative log-density
+            of the training codes to that of the voxels.
+        tolerance: The search stops where the objectives of recent candidates differ by less than
+            this, 0 or more, in nats per voxel; 0 never stops it.
         target: The search stops where the objective is this low, in nats per voxel; None for no
-            target.
-        precision: Arithmetic of the decoder during the search.
+            such target.
+        precision: Precision of the decoder's matrix products during the search, `float32` or
+            `bfloat16`.
 
     Raises:
         ValueError: A setting is outside its range. Arrays of JAX, which may be traced, are not

@@ -1,4 +1,4 @@
-"""The names of searches, and the function behind each; free of JAX, so that help answers at once.
+"""The names of searches, and the function behind each. Nothing here imports JAX.
 
     family, family:variant                     a module of `methods/`, or an entry point of the
                                                group `jaxshape.methods`
@@ -29,10 +29,10 @@ def families() -> list[str]:
 
 
 def find_build(name: str) -> tuple[Build, str | None]:
-    """The function behind a name, and the variant that it is to build.
+    """The function behind the name of a search, and the variant that it builds.
 
     Args:
-        name: Of a search.
+        name: Name of a search.
 
     Returns:
         The function, and the variant or None.

@@ -17,13 +17,14 @@ Penalty = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 
 class Evaluation(NamedTuple):
-    """How codes are scored, for any objects.
+    """Scoring of codes, for any objects.
 
     Attributes:
         loss: `(shared, code [d], own) -> loss`, under any `jax.vmap`s and `jax.grad`; `own` holds
             the features and the target of the code's object.
         shape: `(shared, codes [n d], own [m ...], owner [n]) -> logits [n x y z], losses [n]`.
-        shared: What all objects share: prepared parameters, and what the penalty closes over.
+        shared: Arrays that all objects share: prepared parameters, and the constants of the
+            penalty.
     """
 
     loss: Callable[..., Float[Array, ""]]
@@ -43,11 +44,11 @@ def evaluation(
 
     Args:
         model: The shape model.
-        prepared: Its parameters; only what is shared is used.
-        residual: Scores logits.
-        penalty: What a code costs besides, or None.
-        code: A code, and
-        own: features and target of an object, as examples of their shapes.
+        prepared: Its parameters; only the shared ones are used.
+        residual: The residual that scores logits.
+        penalty: `code -> ` nats per voxel to add; None for no penalty.
+        code: A code `[d]`, as an example of its shape.
+        own: Features and target of an object, as examples of their shapes.
     """
 
     def price(code, logits, target):
@@ -86,14 +87,18 @@ def objective(
 
     Args:
         prior: The shape prior.
-        target: `residual.target(grids, first_logits)` of the object.
+        target: Target of the object, `residual.target(grids, first_logits)`.
         residual: The residual that the target belongs to.
-        penalty: `code -> ` nats per voxel to add.
-        grids: F and M of the object `[x y z]`, for models whose decoder is given the measurement.
-        precision: That of the decoder's products.
+        penalty: `code [d] -> ` nats per voxel to add to the residual; None for no penalty.
+        grids: F and M of the object `[x y z]`, for models whose decoder takes the measurement; None
+            for models that decode from the code alone.
+        precision: Precision of the decoder's matrix products, `float32` or `bfloat16`.
 
     Returns:
         `loss(code [d]) -> ` nats per voxel, differentiable; NaN for a code that is not finite.
+
+    Raises:
+        ValueError: `jax.vmap` batches the parameters of the prior.
     """
     batch = None if grids is None else jax.tree.map(lambda x: jnp.asarray(x)[None], grids)
     prepared = prepare_one(prior, batch, precision)
@@ -112,7 +117,7 @@ def prepare_one(prior: ShapePrior, grids: Grids | None, precision: Precision) ->
     Args:
         prior: The shape prior.
         grids: F and M of the objects `[b ...]`, or None.
-        precision: That of the decoder's products.
+        precision: Precision of the decoder's matrix products.
 
     Raises:
         ValueError: `jax.vmap` batches the parameters.

@@ -9,16 +9,28 @@ from jaxtyping import Array, Float, Int
 
 
 class Constants(NamedTuple):
-    """What follows from the dimension and the population (tutorial, Table 1)."""
+    """Weights and learning rates of CMA-ES (tutorial, Table 1).
 
-    weights: Float[Array, " capacity"]  # w_i; the positive ones sum to 1
-    mu_eff: Float[Array, ""]  # variance-effective number of parents
-    c_sigma: Float[Array, ""]  # rate of the step-size path
-    damping: Float[Array, ""]  # d_sigma
-    c_c: Float[Array, ""]  # rate of the covariance path
-    c_1: Float[Array, ""]  # rate of the rank-one update
-    c_mu: Float[Array, ""]  # rate of the rank-mu update
-    eigen_gap: Int[Array, ""]  # generations between eigendecompositions
+    Attributes:
+        weights: w_i `[capacity]`, recombination weights from the best candidate to the worst; the
+            positive ones sum to 1.
+        mu_eff: Variance-effective number of parents.
+        c_sigma: Learning rate of the evolution path of the step size.
+        damping: d_sigma, damping of the step size.
+        c_c: Learning rate of the evolution path of the covariance.
+        c_1: Learning rate of the rank-one update of the covariance.
+        c_mu: Learning rate of the rank-mu update of the covariance.
+        eigen_gap: Generations between eigendecompositions, 1 or more.
+    """
+
+    weights: Float[Array, " capacity"]
+    mu_eff: Float[Array, ""]
+    c_sigma: Float[Array, ""]
+    damping: Float[Array, ""]
+    c_c: Float[Array, ""]
+    c_1: Float[Array, ""]
+    c_mu: Float[Array, ""]
+    eigen_gap: Int[Array, ""]
 
 
 def default_population(dim: int) -> int:
@@ -34,8 +46,12 @@ def constants(
 ) -> Constants:
     """pycma's default constants for a dimension and a population (tutorial, Table 1).
 
-    The population may be traced if a static `capacity` bounds it: weights behind it are 0. `dtype`
-    is that of the points.
+    Args:
+        dim: Numbers in a point, 1 or more.
+        population: Candidates per generation, 3 or more. It may be traced if `capacity` bounds it.
+        capacity: Length of the weights, static; weights behind the population are 0. None for the
+            population itself.
+        dtype: Type of the points.
     """
     d, size = dim, jnp.asarray(population, dtype)
     rank = jnp.arange(1, (population if capacity is None else capacity) + 1, dtype=size.dtype)

@@ -26,16 +26,17 @@ class Reconstruction(NamedTuple):
     Attributes:
         first_code: Code that the model proposes for what was measured `[object d]`.
         code: Code that the search found `[object d]`.
-        completed_first: The first answer, G(lambda_0) > 0.5 `[object x y z]`.
-        logits: Decoded refined shape `[object x y z]`.
+        completed_first: The decoded first code, G(lambda_0) > 0.5 `[object x y z]`.
+        logits: Logits of the refined shape `[object x y z]`.
         completed: The refined shape, G(lambda) > 0.5 `[object x y z]`.
-        composed: What was measured where something was, the refined shape elsewhere.
+        composed: What was measured where something was, the refined shape elsewhere
+            `[object x y z]`.
         first_objective: Residual of the first code `[object]`, in nats per voxel.
         objective: Residual of the refined code `[object]`, in nats per voxel.
         trace: Trace of the search `[object iteration ...]`; None without a search.
         path: Best code so far after each iteration `[object iteration d]`; None without a search.
         iterations: Iterations that the search took `[object]`; None without a search.
-        stop: Why it ended `[object]`, a `StopReason`; None without a search.
+        stop: Why the search ended `[object]`, as a `StopReason`; None without a search.
     """
 
     first_code: Float[Array, "object d"]
@@ -58,9 +59,13 @@ def compose(
     """Keep what was observed as measured; fill what was occluded with the completed shape.
 
     Args:
-        occupied: F; soft grids are rounded.
-        occluded: M; soft grids are rounded.
-        completed: The decoded shape.
+        occupied: F `[*batch x y z]`; soft grids are rounded.
+        occluded: M `[*batch x y z]`; soft grids are rounded.
+        completed: The decoded shape `[*batch x y z]`, True where occupied.
+
+    Returns:
+        The composed shape `[*batch x y z]`: F where something was measured, the completed shape
+        elsewhere.
     """
     measured = binary(Grids(occupied, occluded))
     return jnp.where(measured.occluded, completed, measured.occupied)
@@ -70,8 +75,9 @@ def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner
     """The search of a method, for the codes of a prior.
 
     Args:
-        method: Its name (`build_refiner`), or "encoder" for no search: the first code stands.
-        prior: The shape prior.
+        method: Name of the search (`build_refiner`), or "encoder" for no search: the first code
+            stands.
+        prior: The shape prior whose codes are searched.
         config: Settings of the search.
 
     Returns:
@@ -86,16 +92,22 @@ def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner
 
 
 def search_space(prior: ShapePrior, config: RefineConfig) -> LatentSpace:
-    """The coordinates in which codes are searched, as `config.space` says."""
+    """The coordinates in which codes are searched, which `config.space` names."""
     return {"whitened": whitened, "raw": raw}[config.space](prior, config.bound)
 
 
 def code_penalty(prior: ShapePrior, weight: float) -> Penalty | None:
-    """What a code costs for lying far from those of the training set.
+    """The cost of a code for its distance from the codes of the training set.
 
-    Half its squared Mahalanobis distance, its negative log-density up to a constant, in nats per
-    voxel as the objective is: with weight 1 the sum of both is least at the most probable code.
-    None for weight 0.
+    It is half the squared Mahalanobis distance, the negative log-density up to a constant, in nats
+    per voxel like the objective: with weight 1 the sum of both is least at the most probable code.
+
+    Args:
+        prior: The shape prior.
+        weight: Weight of the codes' prior density, 0 or more.
+
+    Returns:
+        The penalty; None for weight 0.
     """
     if isinstance(weight, int | float) and weight == 0:
         return None
@@ -118,17 +130,17 @@ def reconstruct(
     """Rebuild a batch of objects from their measurement grids F and occlusion masks M.
 
     Args:
-        keys: One random key for each object, or one for all.
+        keys: One random key for each object `[object]`, or one for all.
         prior: The shape prior.
         occupied: F of each object `[object x y z]`, binary or soft.
         occluded: M of each object `[object x y z]`, binary or soft.
         refiner: The search (`refiner_for`); None lets the first code stand.
         config: Settings of the search.
-        residual: What is minimised, in place of the one that `config.objective` names.
-        earlier: Codes found when less was measured `[object d]`: the search starts from them where
-            they explain the grids better than the first code does.
-        data: Whatever your own model or residual needs of each object, as a pytree whose arrays
-            have a leading axis over objects: `grids.data` of `residual.target` and `encode`.
+        residual: The residual to minimise; None for the one that `config.objective` names.
+        earlier: Codes found when less was measured `[object d]`; the search starts from them where
+            they explain the grids better than the first code does. None starts from the first code.
+        data: Further arrays that your own model or residual needs of each object, as a pytree whose
+            arrays have a leading axis over objects: `grids.data` of `residual.target` and `encode`.
 
     Raises:
         ValueError: The grids have no batch axis, differ in shape, or are not of the prior's
@@ -198,8 +210,12 @@ def reconstruct_jit(
 ) -> Callable[..., Reconstruction]:
     """`reconstruct` with a fixed search, compiled once for each number of objects.
 
-    The same function for the same refiner, settings and residual, so that who asks again need not
-    compile.
+    Equal refiners, settings and residuals give the same function, which is then compiled already.
+
+    Args:
+        refiner: The search; None lets the first code stand.
+        config: Settings of the search.
+        residual: The residual to minimise; None for the one that `config.objective` names.
     """
     return jax.jit(partial(reconstruct, refiner=refiner, config=config, residual=residual))
 
@@ -214,8 +230,14 @@ def fit_surface(
 
     Args:
         prior: The shape prior.
-        surface: Surface voxels of each object.
-        iterations: Steps of Adam.
+        surface: Surface voxels of each object `[object x y z]`.
+        iterations: Steps of Adam, 1 or more.
+
+    Returns:
+        The fitted shapes `[object x y z]`, True where occupied.
+
+    Raises:
+        ValueError: The grids have no batch axis or are not of the prior's resolution.
     """
     config = RefineConfig(iterations=iterations, space="raw", tolerance=0.0)
     grids = Grids(surface, jnp.zeros_like(surface))

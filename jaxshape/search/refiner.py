@@ -1,4 +1,4 @@
-"""What every search over a latent code has in common.
+"""The interface of every search over a latent code.
 
 A `Refiner` is two pure functions over ONE point of the search space (`space.py`). `init` takes the
 first point and its loss, `step` does one iteration; both return the search's state and a `Trace` of
@@ -26,29 +26,45 @@ Objective = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 
 class StopReason(IntEnum):
-    """Why a search ended. All but the first three are the criteria of pycma, by its names."""
+    """Why a search ended. All but the first three are criteria of pycma, by its names.
+
+    Attributes:
+        RUNNING: The search goes on (0).
+        BUDGET: All iterations were used (1).
+        TARGET: The requested loss was reached (2).
+        TOLFUN: Losses of this and of recent iterations lie within `tolfun` (3).
+        TOLFUNHIST: The best losses of recent iterations lie within `tolfunhist` (4).
+        TOLX: The distribution is smaller than `tolx` (5).
+        TOLXSTAGNATION: The mean no longer moves (6).
+        TOLSTAGNATION: The medians of the losses no longer fall (7).
+        TOLFACUPX: The distribution grew a thousandfold, since sigma0 was far too small (8).
+        TOLUPSIGMA: Sigma grows while the distribution shrinks (9).
+        TOLCONDITIONCOV: The covariance is nearly singular (10).
+        TOLFLATFITNESS: The losses of a generation were equal twice in a row (11).
+        NOEFFECT: A step along an axis or a coordinate is lost in rounding (12).
+    """
 
     RUNNING = 0
-    BUDGET = 1  # all iterations were used
-    TARGET = 2  # the loss asked for was reached
-    TOLFUN = 3  # losses of this and of recent iterations lie within tolfun
-    TOLFUNHIST = 4  # the best losses of recent iterations lie within tolfunhist
-    TOLX = 5  # the distribution is smaller than tolx
-    TOLXSTAGNATION = 6  # the mean no longer moves
-    TOLSTAGNATION = 7  # the medians of the losses no longer fall
-    TOLFACUPX = 8  # the distribution grew a thousandfold: sigma0 was far too small
-    TOLUPSIGMA = 9  # sigma grows while the distribution shrinks
-    TOLCONDITIONCOV = 10  # the covariance is nearly singular
-    TOLFLATFITNESS = 11  # the losses of a generation are equal, twice in a row
-    NOEFFECT = 12  # a step along an axis or a coordinate is lost in rounding
+    BUDGET = 1
+    TARGET = 2
+    TOLFUN = 3
+    TOLFUNHIST = 4
+    TOLX = 5
+    TOLXSTAGNATION = 6
+    TOLSTAGNATION = 7
+    TOLFACUPX = 8
+    TOLUPSIGMA = 9
+    TOLCONDITIONCOV = 10
+    TOLFLATFITNESS = 11
+    NOEFFECT = 12
 
 
 class Candidate(NamedTuple):
     """A point together with its loss as it was evaluated.
 
     Attributes:
-        point: Coordinates in the search space.
-        loss: Its loss; +inf where it failed or was not evaluated.
+        point: Coordinates in the search space `[d]`.
+        loss: Loss of the point; +inf where the evaluation failed or was not made.
     """
 
     point: Float[Array, " d"]
@@ -60,9 +76,10 @@ class Distribution(NamedTuple):
 
     Attributes:
         sigma: Step size, the scale that all axes share.
-        standard_deviations: Standard deviation of each coordinate.
-        axis_lengths: Standard deviations along the principal axes, ascending: the eigen-spectrum,
-            with sigma.
+        standard_deviations: Standard deviation of each coordinate `[d]`, in units of the search
+            space.
+        axis_lengths: Standard deviations along the principal axes `[d]`, ascending: square roots of
+            the eigenvalues of sigma^2 C.
     """
 
     sigma: Float[Array, ""]
@@ -71,14 +88,15 @@ class Distribution(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What a reader plots of one iteration.
+    """Figures of one iteration, for plots and tables.
 
     Attributes:
-        best_loss: Lowest loss so far, the start included; never rises.
+        best_loss: Lowest loss so far, the start included; it never rises.
         loss: Lowest finite loss of this iteration's candidates; +inf where all failed.
-        spread: Standard deviation of the candidates, rms over the coordinates.
-        evaluations: Objectives evaluated so far, the start included.
-        distribution: What candidates are drawn from; None for searches that draw from none.
+        spread: Standard deviation of the candidates, root mean square over the coordinates.
+        evaluations: Evaluations of the objective so far, the start included.
+        distribution: The distribution that candidates are drawn from; None for searches that have
+            none.
     """
 
     best_loss: Float[Array, ""]
@@ -97,12 +115,12 @@ class Refiner(NamedTuple):
     own leaves it at RUNNING. Numbers have the type of the point, counters are int32.
 
     Attributes:
-        init: `(key, point, loss) -> state, trace`. It takes the loss of the first point, so that
-            `best` is never worse than the start and no iteration spends an evaluation on it.
+        init: `(key, point [d], loss) -> state, trace`. It takes the loss of the first point, so
+            that `best` is never worse than the start and no iteration spends an evaluation on it.
         step: `(key, state, objective) -> state, trace`, one iteration.
         resume: `(key, state, loss) -> state, trace`, which starts again from the state of an
-            earlier search whose objective has changed since; `loss` is that of `state.best.point`
-            now. Without it, `init` at that point takes its place.
+            earlier search whose objective has changed since; `loss` is the present loss of
+            `state.best.point`. None starts again by `init` at that point.
     """
 
     init: Callable[..., tuple[Any, Trace]]
@@ -119,7 +137,7 @@ def advance(
         refiner: The search.
         key: Random key of this iteration.
         state: The search's state.
-        trace: Of the iteration before.
+        trace: Trace of the iteration before.
         objective: The loss of one point. A search that has stopped asks for points that are not
             finite.
 
@@ -135,7 +153,7 @@ def finite_or_inf(losses: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Rank failed evaluations last.
 
     Args:
-        losses: Any numbers.
+        losses: Losses of any shape, finite or not.
 
     Returns:
         The losses, with +inf for NaN and for both infinities.
@@ -150,8 +168,8 @@ def keep_better(
 
     Args:
         best: The best candidate before.
-        points: What was evaluated since.
-        losses: Their losses, in any order; NaN and infinite ones are failed evaluations.
+        points: Points that were evaluated since `[n d]`.
+        losses: Their losses `[n]`, in any order; NaN and infinite ones are failed evaluations.
 
     Returns:
         `best`, or the first of the points with the lowest loss where that is lower.
@@ -170,7 +188,8 @@ def start_trace(first: Candidate, distribution: Distribution | None = None) -> T
 
     Args:
         first: The first point and its loss.
-        distribution: What candidates will be drawn from, in searches that have one.
+        distribution: The distribution that candidates will be drawn from; None for searches that
+            have none.
 
     Returns:
         A trace with one evaluation and no spread.
@@ -190,10 +209,11 @@ def summarise(
 
     Args:
         best: The best candidate so far, those of this iteration included.
-        points: Candidates of this iteration.
-        losses: Their losses.
-        evaluations: Objectives evaluated so far, the start included.
-        distribution: What candidates are drawn from now, in searches that have one.
+        points: Candidates of this iteration `[n d]`.
+        losses: Losses of these candidates `[n]`.
+        evaluations: Evaluations of the objective so far, the start included.
+        distribution: The distribution that candidates are drawn from now; None for searches that
+            have none.
 
     Returns:
         The trace.

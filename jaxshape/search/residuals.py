@@ -1,13 +1,13 @@
-"""What a search minimises: how badly a decoded shape agrees with what was measured.
+"""What a search minimises: the disagreement of a decoded shape with what was measured.
 
 A `Residual` is two pure functions of ONE object and ONE candidate; the search batches them.
 
     target = residual.target(grids, first_logits)    # once per object
     loss   = residual.score(logits, target)          # for every candidate
 
-Members: Eq. 7 of the paper as printed (`PAPER`), the same with measured free space counted a third
-(`BALANCED`), and weighted by how sure each voxel is (`SOFT`). Your own needs no more than these two
-functions (docs/examples/own_residual.py).
+The package has three: `PAPER` is Eq. 7 of the paper as printed, `BALANCED` is Eq. 7 with a third of
+the weight on measured free space, and `SOFT` is `BALANCED` with each voxel weighted by how sure its
+measurement is. Your own needs no more than these two functions (docs/examples/own_residual.py).
 """
 
 import math
@@ -25,6 +25,10 @@ from jaxshape.geometry.evidence import Grid, Grids, binary
 class Residual(NamedTuple):
     """Two pure functions that score candidates; hashable, so that it can be static under jit.
 
+    The package has three: `PAPER` is Eq. 7 as printed, `BALANCED` is Eq. 7 with a third of the
+    weight on measured free space, and `SOFT` is `BALANCED` with each voxel weighted by how sure its
+    measurement is. `RefineConfig.objective` names them `paper`, `balanced` and `soft`.
+
     Attributes:
         target: `(grids, first_logits [x y z]) -> target`: a pytree of arrays, worked out once from
             what was measured of an object and from its decoded first code, G(lambda_0).
@@ -38,12 +42,13 @@ class Residual(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """How the parts of Eq. 7 are weighed against measured occupied voxels.
+    """Weights of the parts of Eq. 7, relative to measured occupied voxels.
 
     Attributes:
-        free: Weight of measured free space (Eq. 7: 1). A lower weight keeps thin structures from
-            drowning in free space.
-        prior: Factor of alpha, the weight of the prior where nothing was measured (Eq. 7: 1).
+        free: Weight of measured free space, 0 or more (Eq. 7: 1). A lower weight keeps thin
+            structures from drowning in free space.
+        prior: Factor of alpha, the weight of the prior where nothing was measured, 0 or more (Eq.
+            7: 1).
     """
 
     free: float = 1.0
@@ -72,8 +77,8 @@ def weigh(
 
     Args:
         grids: F and M, binary or soft, `[*batch x y z]`.
-        first_logits: The decoded first code, G(lambda_0), as logits.
-        weights: Weights of measured free space and of the prior.
+        first_logits: Logits of the decoded first code, G(lambda_0), `[*batch x y z]`.
+        weights: Weights of measured free space and of the prior; those of Eq. 7 by default.
 
     Returns:
         The target of `cross_entropy`. alpha is sum(M) / sum(1 - M), times `weights.prior`; it is 0
@@ -97,11 +102,15 @@ def _as_weights(grid: Grid, like: Array) -> Array:
 
 
 def cross_entropy(logits: Float[Array, "*batch x y z"], target: Target) -> Float[Array, "*batch"]:
-    """Eq. 7 from logits, in nats per voxel: f carries the 1 / N^3 of the training loss.
+    """The loss of Eq. 7 from logits: a mean over voxels, since f carries the 1 / N^3 of the
+    training loss.
 
     Args:
-        logits: Decoded shapes.
-        target: Weights of the same batch axes.
+        logits: Logits of decoded shapes `[*batch x y z]`.
+        target: Weights of the two terms of each voxel, with the same batch axes.
+
+    Returns:
+        Loss of each shape `[*batch]`, in nats per voxel.
     """
     # -log sigmoid(l) = softplus(-l) = softplus(l) - l, and -log(1 - sigmoid(l)) = softplus(l).
     softplus = jnp.maximum(logits, 0) + jnp.log(1 + jnp.exp(-jnp.abs(logits)))
@@ -115,7 +124,7 @@ def equation_7(weights: Weights = AS_PRINTED) -> Residual:
     """Eq. 7 of the paper, on binary F and M: soft grids are rounded.
 
     Args:
-        weights: Those of Eq. 7 by default.
+        weights: Weights of free space and of the prior; those of Eq. 7 by default.
     """
     return Residual(lambda grids, logits: weigh(binary(grids), logits, weights), cross_entropy)
 
@@ -127,17 +136,18 @@ def soft(weights: Weights = LESS_FREE) -> Residual:
     as strongly towards what was measured there, and half towards the prior.
 
     Args:
-        weights: Those of `BALANCED` by default.
+        weights: Weights of free space and of the prior; those of `BALANCED` by default.
     """
     return Residual(lambda grids, logits: weigh(grids, logits, weights), cross_entropy)
 
 
 PAPER = equation_7()
-"""Eq. 7 as printed."""
+"""Eq. 7 of the paper as printed."""
 BALANCED = equation_7(LESS_FREE)
-"""The best on procedural and CAD chairs, without noise and with it (experiments/objective.py)."""
+"""Eq. 7 with a third of the weight on measured free space: the best on procedural and CAD chairs,
+without noise and with it (experiments/objective.py)."""
 SOFT = soft()
-"""`BALANCED`, weighted by how sure each voxel is."""
+"""Eq. 7 as `BALANCED` weighs it, with each voxel weighted by how sure its measurement is."""
 
 RESIDUALS = {"balanced": BALANCED, "paper": PAPER, "soft": SOFT}
-"""By the names that `RefineConfig.objective` takes."""
+"""The residuals by the names that `RefineConfig.objective` takes."""

@@ -35,31 +35,56 @@ from jaxshape.search.stopping import Tolerances
 
 
 class Run(NamedTuple):
-    """What one run between two restarts is allowed, and has spent."""
+    """Limits and spending of one run between two restarts.
 
-    multiple: Int[Array, ""]  # its population, in iterations
+    Attributes:
+        multiple: Population of the run, as a multiple of the first one: the iterations that a
+            generation takes.
+        sigma0: First standard deviation of the run.
+        is_small: Whether the run counts towards the small regime of BIPOP.
+        iterations: Iterations spent.
+        allowed: Iterations allowed.
+    """
+
+    multiple: Int[Array, ""]
     sigma0: Float[Array, ""]
-    is_small: Bool[Array, ""]  # counts towards the small regime of BIPOP
-    iterations: Int[Array, ""]  # spent
-    allowed: Int[Array, ""]  # iterations
+    is_small: Bool[Array, ""]
+    iterations: Int[Array, ""]
+    allowed: Int[Array, ""]
 
 
 class RestartState(NamedTuple):
-    """The run that is under way, the generation it collects, and what came before."""
+    """The run that is under way, the generation it collects, and what came before.
+
+    Attributes:
+        mean: Centre of the present distribution `[d]`.
+        best: The best candidate of all runs.
+        stop: Why the search ended, as a `StopReason`; RUNNING while it goes on.
+        first: The point that the first run began at, and its loss.
+        search: State of the present run.
+        points: Candidates of the generation that is being collected `[capacity d]`.
+        losses: Losses of these candidates `[capacity]`.
+        run: Limits and spending of the present run.
+        large_runs: Restarts with doubled population.
+        spent_small: Iterations of finished runs with small populations.
+        spent_large: Iterations of finished runs with large populations.
+        restarts: Restarts of either kind.
+        reason: Why the last run ended, as a `StopReason`.
+    """
 
     mean: Float[Array, " d"]
-    best: Candidate  # of all runs
+    best: Candidate
     stop: Int[Array, ""]
-    first: Candidate  # where the first run began
+    first: Candidate
     search: cma.CmaState
-    points: Float[Array, "capacity d"]  # of the generation that is being collected
+    points: Float[Array, "capacity d"]
     losses: Float[Array, " capacity"]
     run: Run
-    large_runs: Int[Array, ""]  # restarts with doubled population
-    spent_small: Int[Array, ""]  # iterations of finished runs
+    large_runs: Int[Array, ""]
+    spent_small: Int[Array, ""]
     spent_large: Int[Array, ""]
     restarts: Int[Array, ""]
-    reason: Int[Array, ""]  # why the last run ended
+    reason: Int[Array, ""]
 
 
 def with_restarts(
@@ -75,17 +100,17 @@ def with_restarts(
     """CMA-ES with restarts; the same number of candidates per iteration, whatever the population.
 
     Args:
-        kind: "ipop", which doubles the population at each restart, or "bipop", which spends as
-            many evaluations on short runs with small populations.
+        kind: "ipop", which doubles the population at each restart, or "bipop", which spends as many
+            evaluations on short runs with small populations.
         dim: Numbers in a point, 1 or more.
         sigma0: First standard deviation, above 0, in units of the search space.
         population: Candidates per iteration and population of the first run, 3 or more; None for
             pycma's 4 + floor(3 ln dim).
         doublings: Doublings of the population, 0 or more. A run after the last of them ends the
             search when it stops.
-        restart_point: Draws the mean of a new run from a key and the first point; without it,
-            every run begins at the first point.
-        tolerances: When a run is over.
+        restart_point: `(key, first point [d]) -> point [d]`, the mean of a new run; None begins
+            every run at the first point.
+        tolerances: Stop criteria that end a run.
 
     Returns:
         The search.

@@ -28,14 +28,15 @@ class Refined(NamedTuple):
 
     Attributes:
         code: The best code that was evaluated `[object d]`.
-        logits: Its decoded shape `[object x y z]`, occupied where positive.
+        logits: Logits of its decoded shape `[object x y z]`, occupied where positive.
         loss: Its objective `[object]`, in nats per voxel, with the penalty if there is one.
-        trace: What a reader plots `[object iteration ...]`; constant once the object's search has
-            stopped.
+        trace: Figures of each iteration `[object iteration ...]`; constant once the object's search
+            has stopped.
         path: The best code so far, after each iteration `[object iteration d]`.
-        iterations: How many iterations the search took before it stopped `[object]`.
-        stop: Why it stopped `[object]`, a `StopReason`.
-        state: State of the refiner, one per object; a later search can start from it.
+        iterations: Iterations that the search took before it stopped `[object]`.
+        stop: Why the search stopped `[object]`, as a `StopReason`.
+        state: State of the refiner, one for each object; a later search can start from it
+            (`previous`).
     """
 
     code: Float[Array, "object d"]
@@ -71,24 +72,27 @@ def refine(
     search has stopped is frozen and no longer decoded.
 
     Args:
-        keys: One random key for each object, or one for all, which is split. Objects do not
-            influence each other, and find the same in any company.
+        keys: One random key for each object `[object]`, or one for all, which is split. The result
+            of an object does not depend on the others in its batch.
         prior: The shape prior.
-        codes: First code of each object.
+        codes: First code of each object `[object d]`.
         targets: Target of each object, `residual.target(grids, first_logits)`: a pytree whose
             arrays have a leading axis over objects.
-        refiner: The search.
-        iterations: Steps of the search at most.
+        refiner: The search to run, as `build_refiner` gives it.
+        iterations: Steps of the search at most, 1 or more.
         residual: The residual that the targets belong to.
-        grids: F and M of each object, for models whose decoder is given the measurement.
-        space: Coordinates of the search; the codes themselves by default.
-        penalty: `code -> ` nats per voxel, added to the objective.
-        first_losses: Objectives of the first codes, where they are known.
-        target_loss: Objective that is low enough to stop.
-        previous: States of an earlier search in the same space: this one goes on from these
-            instead of from `codes`.
-        precision: That of the decoder's products during the search; `logits` and `loss` are float32
-            in any case.
+        grids: F and M of each object `[object x y z]`, for models whose decoder takes the
+            measurement; None for models that decode from the code alone.
+        space: Coordinates of the search; None for the codes themselves.
+        penalty: `code [d] -> ` nats per voxel, added to the residual; None for no penalty.
+        first_losses: Objectives of the first codes `[object]`, in nats per voxel; None where they
+            are not known.
+        target_loss: Objective that is low enough to stop, in nats per voxel; None for no such
+            target.
+        previous: States of an earlier search in the same space (`Refined.state`): this search goes
+            on from them instead of from `codes`. None starts from `codes`.
+        precision: Precision of the decoder's matrix products during the search, `float32` or
+            `bfloat16`; `logits` and `loss` are float32 in any case.
 
     Raises:
         ValueError: The arguments do not belong to the same number of objects, or `jax.vmap` is
@@ -150,7 +154,7 @@ def refine(
 
 
 def _evaluation(prior, prepared, residual, penalty, codes, targets) -> Evaluation:
-    """How codes are scored, from the first object of a batch."""
+    """The scoring of codes, with the first object of a batch as an example of shapes."""
     own = pick((prepared.own, targets), 0)
     return evaluation(prior.model, prepared, residual, penalty, codes[0], own)
 
@@ -177,6 +181,11 @@ def keys_of(
     keys: Key[Array, "*object"], codes: Float[Array, "object d"], prior: ShapePrior
 ) -> Key[Array, " object"]:
     """One key for each code, from one for each or one for all.
+
+    Args:
+        keys: One key for each code `[object]`, or one for all.
+        codes: Codes of the objects `[object d]`.
+        prior: The shape prior.
 
     Raises:
         ValueError: There are neither as many keys as codes nor one, or codes have another size.

@@ -21,9 +21,9 @@ class LatentSpace(NamedTuple):
     Attributes:
         mean: Code of the point 0 `[d]`.
         root: Lower triangular matrix `[d d]`, with root @ root.T the covariance of the codes; None
-            where points are measured in codes.
-        bound: Points are folded into the box of this half side, in the units of points; None for no
-            box.
+            where points have the units of codes.
+        bound: Half side of the box that points are folded into, above 0, in units of points; None
+            for no box.
     """
 
     mean: Float[Array, "*d"]
@@ -31,7 +31,11 @@ class LatentSpace(NamedTuple):
     bound: Float[Array, ""] | float | None = None
 
     def to_code(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The code of a point."""
+        """The code of a point.
+
+        Args:
+            point: A point of the search space `[d]`; outside the bounds it is folded back.
+        """
         step = fold(point, self.bound)
         if self.root is not None:
             step = jnp.dot(self.root, step, precision="highest")
@@ -42,6 +46,9 @@ class LatentSpace(NamedTuple):
 
         Close to the bounds `to_code` moves it a little further in: at the very edge, where the
         fold turns back, a gradient could not leave again.
+
+        Args:
+            code: A code `[d]`.
         """
         point = code - self.mean
         if self.root is not None:
@@ -54,7 +61,8 @@ def whitened(prior: ShapePrior, bound: float | None = None) -> LatentSpace:
 
     Args:
         prior: The shape prior.
-        bound: Half side of the box around the mean, in standard deviations; None for no box.
+        bound: Half side of the box around the mean, above 0, in standard deviations; None for no
+            box.
 
     Raises:
         ValueError: The covariance of the codes is not positive semi-definite (told outside
@@ -81,7 +89,7 @@ def raw(prior: ShapePrior, bound: float | None = None) -> LatentSpace:
 
     Args:
         prior: The shape prior.
-        bound: Half side of the box around 0, in codes; None for no box.
+        bound: Half side of the box around 0, above 0, in units of codes; None for no box.
     """
     return LatentSpace(jnp.zeros_like(prior.code_mean), None, bound)
 

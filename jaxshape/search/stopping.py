@@ -23,19 +23,23 @@ RECORD_EVERY = 5
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Thresholds of the criteria; 0 (or infinity for those that are upper limits) turns one off.
+    """Thresholds of the stop criteria of CMA-ES, by pycma's names, each 0 or more.
+
+    0 turns a criterion off, infinity those that are upper limits. A range or a length below its
+    threshold ends the search.
 
     Attributes:
         tolfun: Range of the losses of a generation and of the best losses of recent ones.
         tolfunhist: Range of the best losses of recent generations.
-        tolx: Standard deviation of every coordinate.
-        tolxstagnation: Distance the mean moves over 20 generations and a tenth of all.
-        tolstagnation: Whether to end after 100 + 100 d^1.5 / population generations without
-            falling medians.
+        tolx: Standard deviation of every coordinate, in units of the search space.
+        tolxstagnation: Distance that the mean moves over 20 generations and a tenth of all, in
+            units of the search space.
+        tolstagnation: Whether to end after 100 + 100 d^1.5 / population generations without falling
+            medians.
         tolfacupx: Growth of a coordinate's standard deviation over sigma0; an upper limit.
         tolupsigma: Growth of sigma over sigma0 and over the longest axis; an upper limit.
         tolconditioncov: Condition number of the covariance; an upper limit.
-        tolflatfitness: Generations in a row of which three quarters of the losses are equal; an
+        tolflatfitness: Generations in a row in which three quarters of the losses are equal; an
             upper limit.
         noeffect: Whether to end where a step no longer changes the mean.
 
@@ -65,29 +69,34 @@ class Tolerances:
 
 
 class History(NamedTuple):
-    """What the criteria remember; newest entries first."""
+    """What the stop criteria remember of a search; newest entries first.
+
+    Attributes:
+        tolstagnation: Generations without improvement that end a search; restarts keep the number
+            of the first run.
+        best_losses: Best losses of recent generations `[short]`; +inf before the first.
+        recorded: Entries of the long history, counted even where they no longer fit.
+        long_best: Best loss of every fifth generation `[long]`.
+        long_median: Median loss of every fifth generation `[long]`.
+        flat: Generations in a row whose losses were flat.
+        anchor: Where the mean was when it last moved `[d]`.
+        anchored: The generation in which it last moved.
+        lowest: Best loss of all generations.
+        improved: The evaluation in which that loss was found, counted from 1.
+        stagnates: Whether the long history no longer falls.
+    """
 
     tolstagnation: Int[Array, ""]
-    """Generations without improvement that end a search; restarts keep that of the first run."""
     best_losses: Float[Array, " short"]
-    """Of recent generations; +inf before the first."""
     recorded: Int[Array, ""]
-    """Entries of the long history, counted even where they no longer fit."""
     long_best: Float[Array, " long"]
     long_median: Float[Array, " long"]
-    """Of every fifth generation."""
     flat: Int[Array, ""]
-    """Generations in a row whose losses were flat."""
     anchor: Float[Array, " d"]
-    """Where the mean was when it last moved."""
     anchored: Int[Array, ""]
-    """The generation of that."""
     lowest: Float[Array, ""]
-    """Best loss of all generations."""
     improved: Int[Array, ""]
-    """The evaluation in which it was found, counted from 1."""
     stagnates: Bool[Array, ""]
-    """Whether the long history no longer falls."""
 
 
 def no_history(point: Float[Array, " d"], population: int) -> History:
@@ -112,7 +121,7 @@ def no_history(point: Float[Array, " d"], population: int) -> History:
 
 
 def _recent(dim: int, population: Any) -> Any:
-    """How many generations pycma's short history holds, 10 + 30 d / population."""
+    """Generations in pycma's short history, 10 + 30 d / population."""
     return 10 + 30 * dim // population
 
 
@@ -128,10 +137,15 @@ def check(
     population: int | Int[Array, ""],
     tolerances: Tolerances,
 ) -> Any:
-    """The state after `tell`, with its history and, where a criterion is met, its stop reason.
+    """The state after `cma_tell`, with its history and, where a criterion is met, its stop reason.
 
-    `losses` are those of the generation that `tell` has just seen. A traced population may be
-    smaller than their number; those behind it do not count.
+    Args:
+        state: The state that `cma_tell` returned.
+        losses: Losses of the generation that `cma_tell` has just seen `[capacity]`.
+        sigma0: First standard deviation of the search.
+        population: Candidates of the generation. A traced population may be smaller than the number
+            of losses; those behind it do not count.
+        tolerances: Thresholds of the criteria.
     """
     counts = jnp.arange(len(losses)) < population
     losses = jnp.where(counts, finite_or_inf(losses), jnp.inf)
@@ -235,7 +249,7 @@ def _criteria(
 
 
 def _compare_windows(history: History) -> tuple[History]:
-    """Whether neither best nor median losses are lower in the newer of two windows."""
+    """Note whether neither best nor median losses are lower in the newer of two windows."""
     window = _window(history.tolstagnation)
     place = jnp.arange(len(history.long_best))
 

@@ -27,7 +27,8 @@ def prior_of(params):
 
 
 def encode(params, grid):
-    return shapes.encode(prior_of(params), Grids(grid, grid))
+    nothing = jnp.zeros(grid.shape, bool)
+    return shapes.encode(prior_of(params), Grids(grid, nothing))
 
 
 def decode(params, code):

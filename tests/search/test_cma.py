@@ -1,8 +1,6 @@
 """CMA-ES: pycma and cmaes as oracles, invariances, hostile losses, batches."""
 
-import doctest
 import functools
-import sys
 
 import cma as pycma
 import cmaes
@@ -364,11 +362,6 @@ def test_covariance_stays_positive_definite_in_float32_over_500_generations():
 
 
 # --- the refiner ------------------------------------------------------------------------------
-
-
-def test_the_examples_of_ask_and_tell_run():
-    found = doctest.testmod(sys.modules["jaxshape.search.cma"])
-    assert found.attempted == 6 and not found.failed
 
 
 def test_converges():

@@ -16,6 +16,8 @@ from jaxshape.search.objective import objective
 from jaxshape.search.residuals import BALANCED, Residual, Target, cross_entropy
 from jaxshape.search.run import refine
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 
 def losses_of(prior, codes, targets, **options):
     """Losses of all candidates of all objects."""
@@ -111,6 +113,24 @@ def test_a_residual_of_ones_own_sees_the_objects_own_data(linear_prior):
     for i, k in np.ndindex(3, 2):
         expected = np.mean((np.asarray(logits[i, k], np.float64) - i * np.asarray(F[i])) ** 2)
         np.testing.assert_allclose(losses[i, k], expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_slopes_of_the_network_are_right_in_64_bits(prior, dtype):
+    """Accumulators without a type of their own were float64, and every gradient an error."""
+    grids = np.asarray(jax.random.bernoulli(jax.random.key(1), 0.3, (2, 32, 32, 32)), np.float32)
+    code = np.linspace(-1, 1, 10)
+
+    def slope(prior, code):
+        return jax.jit(jax.value_and_grad(objective(prior, Target(*grids))))(code)
+
+    loss, expected = slope(prior, jnp.float32(code))
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), dtype), prior)
+        found_loss, found = slope(wide, jnp.asarray(code))
+        assert found_loss.dtype == found.dtype == jnp.float64
+        np.testing.assert_allclose(found_loss, loss, rtol=1e-4)
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -10,16 +10,29 @@ from jaxshape.data.chairs.seats import Seat
 
 
 class Rest(NamedTuple):
-    """The surface a back lies in: u in [-1, 1] from left to right, v from 0 (seat) to 1 (top)."""
+    """The surface that a back lies in.
+
+    Its coordinates are u in [-1, 1], from left to right, and v from 0 (seat) to 1 (top).
+
+    Attributes:
+        y: Height of the bottom, in metres.
+        z: Place of the bottom along the depth of the chair, in metres.
+        height: Height of the top above the bottom, in metres.
+        half_bottom: Half the width at the bottom, in metres.
+        half_top: Half the width at the top, in metres.
+        lean: Distance of the top behind the bottom, in metres.
+        bow: Distance of the middle height behind the chord, in metres.
+        curve: Distance of the sides in front of the middle, in metres.
+    """
 
     y: Number
     z: Number
     height: Number
     half_bottom: Number
     half_top: Number
-    lean: Number  # how far the top lies behind the bottom, metres
-    bow: Number  # how far the middle height lies behind the chord, metres
-    curve: Number  # how far the sides come forward of the middle, metres
+    lean: Number
+    bow: Number
+    curve: Number
 
     def at(self, u: np.ndarray | float, v: np.ndarray | float) -> np.ndarray:
         """Points [..., 3] at (u, v), which broadcast; v may run past [0, 1]."""

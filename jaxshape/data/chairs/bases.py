@@ -20,7 +20,12 @@ from jaxshape.data.chairs.seats import Seat
 
 
 class Legs(NamedTuple):
-    """Upper and lower ends of four legs [4, 3]: front left, front right, back right, back left."""
+    """Four legs: front left, front right, back right, back left.
+
+    Attributes:
+        tops: Upper ends `[4 3]`, in metres.
+        feet: Lower ends `[4 3]`, in metres.
+    """
 
     tops: np.ndarray
     feet: np.ndarray

@@ -335,10 +335,20 @@ STOUT_SHARE = 0.3
 
 
 def random_chair(seed: int | np.integer, *, style: str | None = None) -> trimesh.Trimesh:
-    """The chair of a seed: closed outward-facing parts, metres, +y up, front +z, box at the origin.
+    """Make the procedural chair of a seed. [host]
 
-    Without a style, one is drawn by `FREQUENCIES`. `metadata` holds `style`, `seed` and `drawn`,
-    the named choices (seat, base, back, arms, ...). A negative seed or an unknown style raises.
+    Args:
+        seed: Seed of the chair, 0 or more; those from 1,000,000 on are kept for tests.
+        style: One of the styles of `jaxshape.data.chairs.STYLES`; None to draw one by its
+            frequency.
+
+    Returns:
+        A mesh of closed parts that face outwards, in metres, +y up, front along +z, box centred at
+        the origin. Its `metadata` holds `style`, `seed` and `drawn`, the named choices (seat, base,
+        back, arms, ...).
+
+    Raises:
+        ValueError: The seed is negative, or there is no such style.
     """
     if seed < 0:
         raise ValueError(f"A chair's seed was {seed}; give a whole number that is not negative.")

@@ -20,7 +20,12 @@ X, Y, Z = np.eye(3)
 
 
 class Part(NamedTuple):
-    """`pieces` closed surfaces that share one connectivity."""
+    """`pieces` closed surfaces that share one connectivity.
+
+    Attributes:
+        vertices: Vertices of each piece, in metres.
+        faces: Indices of the vertices of each triangle.
+    """
 
     vertices: Float[np.ndarray, "pieces v 3"]
     faces: Int[np.ndarray, "f 3"]

@@ -18,14 +18,23 @@ from jaxshape.data.chairs.primitives import (
 
 
 class Seat(NamedTuple):
-    """The size of a seat, in metres, about x = z = 0; `height` is its upper face above floor."""
+    """The size of a seat, in metres, about x = z = 0.
+
+    Attributes:
+        width: Extent along x.
+        depth: Extent along z.
+        height: Height of its upper face above the floor.
+        thickness: Extent along y.
+        exponent: Exponent of the outline's superellipse: 2 is round, 10 square.
+        taper: Share of the width by which the back edge is narrower.
+    """
 
     width: Number
     depth: Number
     height: Number
     thickness: Number = 0.03
-    exponent: Number = 8.0  # of the outline's superellipse: 2 round, 10 square
-    taper: Number = 0.0  # how much narrower the back edge is, over the width
+    exponent: Number = 8.0
+    taper: Number = 0.0
 
     def half_width(self, z: Number) -> float:
         """Half the seat's width at depth z."""

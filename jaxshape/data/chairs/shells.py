@@ -23,11 +23,17 @@ _STATIONS = 0.5 * np.linspace(0, 1, 20) + 0.25 * (1 - np.cos(np.pi * np.linspace
 
 
 class Profile(NamedTuple):
-    """A side view [points, 2] as (z, y) from the front edge to the top of the back."""
+    """A side view of a shell, from the front edge to the top of the back.
+
+    Attributes:
+        points: Points `[points 2]` as (z, y), in metres.
+        normals: Unit normals towards the sitter `[points 2]`.
+        share: Share of the arc length `[points]`, from 0 at the front edge to 1 at the top.
+    """
 
     points: np.ndarray
-    normals: np.ndarray  # toward the sitter
-    share: np.ndarray  # of the arc length, 0 at the front edge and 1 at the top
+    normals: np.ndarray
+    share: np.ndarray
 
 
 def bent_profile(corners: list[Range], radius: Number) -> Profile:

@@ -38,10 +38,15 @@ from jaxshape.data.sequences.trajectories import write_trajectory as write_traje
 
 
 class Layout(NamedTuple):
-    """How one kind of recording lies on disk."""
+    """One kind of recording on disk.
+
+    Attributes:
+        needs: The files it cannot do without, in a few words.
+        fits: Whether a folder is of this layout.
+        list_frames: Lists the files of each frame of a folder.
+    """
 
     needs: str
-    """The files it cannot do without, in a few words."""
     fits: Callable[[Contents], bool]
     list_frames: Callable[[Contents], Listed]
 
@@ -53,20 +58,28 @@ LAYOUTS: dict[str, Layout] = {
     "bundlesdf": Layout("depth/*.png, cam_K.txt", folders.fits_bundlesdf, folders.list_bundlesdf),
     "open3d": Layout("depth/*.png", folders.fits_open3d, folders.list_open3d),
 }
-"""In the order in which a folder is tried against them: the last fits whatever has depth images."""
+"""Layouts in the order in which they are tried: the last fits any folder with depth images."""
 
 
 def open_sequence(
     path: str | Path, *, depth_scale: float | None = None, layout: str | None = None
 ) -> Sequence:
-    """Open a folder of RGB-D frames without reading its images.
+    """Open a folder of RGB-D frames without reading its images. [host]
 
-    The `layout` is one of `LAYOUTS`, by default the first that fits; `depth_scale`, the depth units
-    in a metre, is by default that of the layout. Where the folder holds no camera, the one such
-    recordings are made with is taken, and `findings` say so if that is a guess.
+    Images and poses are checked when their frame is read. Where the folder holds no camera, the one
+    that such recordings are made with is taken, and `findings` say so if that is a guess.
 
-    Raises `SequenceError` where no layout fits, where files are missing, and for intrinsics that do
-    not fit the images; the images and poses are checked when their frame is read.
+    Args:
+        path: Folder of the recording.
+        depth_scale: Depth units in a metre, above 0; None for those of the layout.
+        layout: Name of the layout: `7-scenes`, `tum`, `redwood`, `bundlesdf` or `open3d`; None for
+            the first that fits.
+
+    Returns:
+        The recording: `len`, indexing and iteration read one frame at a time.
+
+    Raises:
+        SequenceError: No layout fits, files are missing, or the intrinsics do not fit the images.
     """
     if depth_scale is not None and not depth_scale > 0:
         raise SequenceError(
@@ -123,7 +136,7 @@ def _checked_layout(name: str) -> str:
 
 
 def _nothing_fits(contents: Contents) -> str:
-    """What was found, what each layout needs, and a folder nearby that fits."""
+    """A sentence on what was found, what each layout needs, and a folder nearby that fits."""
     folder, seen = contents.folder, sorted(contents.folders) + sorted(contents.files)
     found = f"{', '.join(seen[:4])}{', ...' if len(seen) > 4 else ''}" if seen else "nothing"
     needs = "; ".join(f"{name}: {layout.needs}" for name, layout in LAYOUTS.items())

@@ -21,20 +21,29 @@ Matrix = Float[np.ndarray, "3 3"]
 
 
 class Camera(NamedTuple):
-    """Intrinsics, and where they come from."""
+    """Intrinsics and their source.
+
+    Attributes:
+        intrinsics: Camera matrix, in pixels.
+        source: Where the intrinsics come from.
+    """
 
     intrinsics: Float[np.ndarray, "3 3"]
     source: str
 
 
 class DefaultCamera(NamedTuple):
-    """What a kind of recording is known to be made with, where its folder holds no camera."""
+    """The camera that a kind of recording is known to be made with.
+
+    Attributes:
+        numbers: fx, fy, cx, cy in OpenCV's pixels, of 640 x 480 images.
+        source: Where the numbers come from.
+        sure: Whether the camera was calibrated for this very recording, or is a guess.
+    """
 
     numbers: tuple[float, float, float, float]
-    """fx, fy, cx, cy in OpenCV's pixels, of 640 x 480 images."""
     source: str
     sure: bool
-    """Whether it was calibrated for this very recording, or is a guess."""
 
 
 PRIMESENSE = (525.0, 525.0, 319.5, 239.5)
@@ -76,7 +85,7 @@ def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int])
 
 
 def guessed(camera: Camera) -> Finding:
-    """What to say of a camera that nothing vouches for."""
+    """The remark on a camera that is a guess."""
     fx, fy, cx, cy = intrinsic_numbers(camera.intrinsics)
     return Finding(
         f"no camera file; focal lengths {fx:g}, {fy:g} and principal point {cx:g}, {cy:g} are "

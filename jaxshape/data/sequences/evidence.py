@@ -1,4 +1,4 @@
-"""Do the poses of a recording fit its depth images?"""
+"""Whether the poses of a recording fit its depth images."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,12 +14,17 @@ Pose = Float[np.ndarray, "4 4"]
 
 
 class PoseAgreement(NamedTuple):
-    """Share of depth pixels which a neighbouring frame sees at the same place, from 0 to 1."""
+    """Share of depth pixels which a neighbouring frame sees at the same place.
+
+    Attributes:
+        as_given: Share with the poses as given, from 0 to 1.
+        inverted: Share with each pose inverted, from 0 to 1.
+        pairs: Pairs of frames that were compared; the shares are 0 if there were none.
+    """
 
     as_given: float
     inverted: float
     pairs: int
-    """How many pairs of frames were compared; the shares are 0 if there were none."""
 
 
 def poses_look_inverted(sequence: Sequence) -> bool:
@@ -32,7 +37,7 @@ def poses_look_inverted(sequence: Sequence) -> bool:
 
 
 def looks_inverted(agreement: PoseAgreement) -> bool:
-    """Whether an agreement says so clearly."""
+    """Whether an agreement is clearly better with inverted poses."""
     return agreement.inverted > agreement.as_given + 0.1
 
 

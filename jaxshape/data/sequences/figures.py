@@ -21,7 +21,13 @@ SAMPLES = 12
 
 
 class Gap(NamedTuple):
-    """Frames that are missing, to judge by the numbers or times of those around them."""
+    """Frames that are missing, by the numbers or times of those around them.
+
+    Attributes:
+        after: Name of the frame before the gap.
+        before: Name of the frame after the gap.
+        missing: Number of missing frames.
+    """
 
     after: str
     before: str
@@ -29,36 +35,46 @@ class Gap(NamedTuple):
 
 
 class Depths(NamedTuple):
-    """Of all pixels of the sampled depth images."""
+    """Figures of all pixels of the sampled depth images.
+
+    Attributes:
+        median: Median depth of the valid pixels, in metres; 0 if there are none.
+        invalid: Share of pixels that hold nothing, saturated ones included, from 0 to 1.
+        saturated: Share of pixels that are saturated, from 0 to 1.
+        sampled: Images that could be read.
+        black: Images of these that hold no valid pixel.
+        damaged: A sentence for each image that could not be read.
+    """
 
     median: float
-    """Metres, of the valid pixels; 0 if there are none."""
     invalid: float
-    """Share of pixels that hold nothing, from 0 to 1; `saturated` among them."""
     saturated: float
     sampled: int
-    """Images that could be read."""
     black: int
-    """Of these, how many hold no valid pixel."""
     damaged: tuple[str, ...]
-    """Of each image that could not be read, a sentence."""
 
 
 class Poses(NamedTuple):
-    """Of all frames."""
+    """Figures of the poses of all frames.
+
+    Attributes:
+        known: Frames with a pose.
+        length: Length of the camera's path between frames with poses, in metres.
+        agreement: Agreement of the poses with the depth images.
+        scales: Depth scales, and the share of depth pixels that agree with neighbouring frames at
+            each.
+        damaged: A sentence for each pose that cannot be used.
+    """
 
     known: int
     length: float
-    """Of the camera's way between frames with poses, metres."""
     agreement: PoseAgreement
     scales: dict[float, float]
-    """Depth scales, and the share of depth pixels that agree with neighbouring frames at each."""
     damaged: tuple[str, ...]
-    """Of each pose that cannot be used, a sentence."""
 
 
 def depths_of(sequence: Sequence) -> Depths:
-    """Look at some depth images; raises the first's `SequenceError` if none can be read."""
+    """Figures of some depth images; raises the `SequenceError` of the first if none can be read."""
     raw, damaged = [], []
     for index in _sampled(sequence):
         try:
@@ -116,7 +132,7 @@ def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
 
 
 def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:
-    """Where frames are missing, by the times of the frames, or else by the numbers in their names.
+    """Gaps between frames, by the times of the frames, or else by the numbers in their names.
 
     A step between frames is a gap when it is half as long again as the usual one.
     """

@@ -25,30 +25,50 @@ class SequenceError(ValueError):
 
 
 class Finding(NamedTuple):
-    """Something a user should know about a recording that can still be read."""
+    """A remark on a recording that can still be read.
+
+    Attributes:
+        evidence: What was noticed.
+        advice: What to do about it.
+    """
 
     evidence: str
     advice: str
 
 
 class Frame(NamedTuple):
-    """One RGB-D image."""
+    """One RGB-D image.
+
+    Attributes:
+        name: Name of the frame, from its files.
+        depth: Depth along the optical axis `[h w]`, in metres, float32; 0 where nothing was
+            measured.
+        color: Colour at the pixels of `depth` `[h w 3]`, scaled to its size; None where there is no
+            colour image.
+        T_world_camera: Pose of the camera `[4 4]`; None where no pose was given, or the recorder's
+            own tracking was lost.
+        mask: True on the object `[h w]`; None where no mask was given.
+        time: Time of the depth image from any start, in seconds; None where the recording does not
+            tell.
+    """
 
     name: str
     depth: Float[np.ndarray, "h w"]
-    """z along the optical axis in metres, float32; 0 where nothing was measured."""
     color: UInt8[np.ndarray, "h w 3"] | None
-    """What the colour camera saw at the pixels of `depth`, scaled to its size."""
     T_world_camera: Float[np.ndarray, "4 4"] | None
-    """None where no pose was given, or its own tracking was lost."""
     mask: Bool[np.ndarray, "h w"] | None
-    """True on the object; None where no mask was given."""
     time: float | None = None
-    """Of the depth image, in seconds from any start; None where the recording does not tell."""
 
 
 class FrameFiles(NamedTuple):
-    """Where the images of one frame lie."""
+    """Files of one frame.
+
+    Attributes:
+        name: Name of the frame.
+        depth: Depth image.
+        color: Colour image; None for none.
+        mask: Mask of the object; None for none.
+    """
 
     name: str
     depth: Path
@@ -58,32 +78,40 @@ class FrameFiles(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """A lazy sequence of frames: `len`, indexing and iteration read one frame at a time."""
+    """A lazy sequence of frames: `len`, indexing and iteration read one frame at a time.
+
+    Attributes:
+        layout: Name of the layout on disk, a key of `LAYOUTS`.
+        intrinsics: Camera matrix of all depth images `[3 3]`, in pixels, where column j covers u in
+            [j, j + 1).
+        camera: Where the intrinsics come from.
+        files: Files of each frame.
+        read_pose: Index of a frame, from 0, to its T_world_camera `[4 4]`, checked; None where
+            there is none.
+        has_poses: Whether poses were given, though perhaps not for every frame.
+        shape: Height and width of all images when read, in pixels.
+        depth_scale: Depth units in a metre, above 0.
+        times: Times of the depth images `[n]`, in seconds; None where the recording does not tell.
+        color_delays: Seconds from a depth image to its colour image `[n]`, NaN where it has none;
+            None without times.
+        findings: Remarks made on opening that a user should know.
+    """
 
     layout: str
-    """Name of the layout on disk, a key of `LAYOUTS`."""
     intrinsics: Float[np.ndarray, "3 3"]
-    """Of all depth images, in pixels, where column j covers u in [j, j + 1)."""
     camera: str
-    """Where the intrinsics come from."""
     files: tuple[FrameFiles, ...]
     read_pose: Callable[[int], Float[np.ndarray, "4 4"] | None]
-    """Index of a frame, from 0, to its T_world_camera, checked; None where there is none."""
     has_poses: bool
-    """Whether poses were given, though perhaps not of every frame."""
     shape: tuple[int, int]
-    """Height and width which all images have when read, in pixels."""
     depth_scale: float
-    """Depth units per metre."""
     times: Float[np.ndarray, " n"] | None = None
-    """Of the depth images, in seconds; None where the recording does not tell."""
     color_delays: Float[np.ndarray, " n"] | None = None
-    """Seconds from a depth image to its colour, NaN where it has none; None without times."""
     findings: tuple[Finding, ...] = ()
-    """What was noticed on opening that a user should know."""
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the frames."""
         return tuple(files.name for files in self.files)
 
     def __len__(self) -> int:
@@ -105,7 +133,11 @@ class Sequence:
         return (self[index] for index in range(len(self)))
 
     def read_depth(self, index: int) -> Float[np.ndarray, "h w"]:
-        """Read the depth image of one frame, and nothing else of it."""
+        """Read the depth image of one frame, and nothing else of it.
+
+        Args:
+            index: Number of the frame, from 0.
+        """
         return read_depth(self.files[index].depth, self.shape, depth_scale=self.depth_scale)
 
 
@@ -117,8 +149,14 @@ def read_depth(
 ) -> Float[np.ndarray, "h w"]:
     """Read a 16-bit depth image as metres in float32; 0 where it holds 0 or 65535.
 
-    Raises `SequenceError` if the image is damaged, not 16 bit, not of height and width `shape`, or
-    if its median depth shows that `depth_scale` is wrong.
+    Args:
+        path: The image.
+        shape: Height and width that it must have, in pixels.
+        depth_scale: Depth units in a metre.
+
+    Raises:
+        SequenceError: The image is damaged, not 16 bit or of another size, or its median depth
+            shows that `depth_scale` is wrong.
     """
     raw = read_raw_depth(path, shape)
     valid = (raw > 0) & (raw < SATURATED)
@@ -145,7 +183,7 @@ def read_raw_depth(path: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w
 
 
 def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
-    """What a median depth, in metres, says against the scale it was read with."""
+    """A remark on the depth scale where a median depth, in metres, is implausible."""
     low, high = _PLAUSIBLE_MEDIAN_DEPTH
     if low <= median <= high:
         return None
@@ -157,7 +195,7 @@ def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
 
 
 def likely_depth_scale(median: float, depth_scale: float) -> float:
-    """Of the usual scales, the one at which a median depth becomes that of an object in a room."""
+    """The usual scale at which a median depth becomes that of an object in a room."""
     usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
     return min(USUAL_DEPTH_SCALES, key=lambda scale: abs(np.log(scale / usual)))
 

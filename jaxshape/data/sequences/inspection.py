@@ -1,4 +1,4 @@
-"""What a user should know of a recording: its figures, and warnings with their evidence."""
+"""Inspection of a recording: its figures, and warnings with their evidence."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -28,25 +28,35 @@ _USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; beyond them a scale is doub
 
 
 class Inspection(NamedTuple):
-    """What `inspect_sequence` finds."""
+    """Findings of `inspect_sequence`.
+
+    Attributes:
+        depths: Figures of the sampled depth images.
+        poses: Figures of the poses; None where the recording has none.
+        colors: Frames with a colour image.
+        masks: Frames with a mask.
+        gaps: Missing frames.
+        rate: Depth images a second; None without times.
+        warnings: What looks wrong, and what to do about it.
+    """
 
     depths: Depths
     poses: Poses | None
-    """None where the recording has none."""
     colors: int
-    """Frames with a colour image."""
     masks: int
-    """Frames with a mask."""
     gaps: tuple[Gap, ...]
     rate: float | None
-    """Depth images a second; None without times."""
     warnings: tuple[Finding, ...]
 
 
 def inspect_sequence(sequence: Sequence) -> Inspection:
     """Look at a recording: names and poses of all frames, and images of some.
 
-    Raises the `SequenceError` of the first if none of the sampled depth images can be read.
+    Args:
+        sequence: The recording.
+
+    Raises:
+        SequenceError: None of the sampled depth images can be read.
     """
     depths, poses, gaps = depths_of(sequence), poses_of(sequence), gaps_of(sequence)
     better = _better_scale(poses, sequence.depth_scale, depths.median)
@@ -99,7 +109,13 @@ def _of_images(depths: Depths, pictures: tuple[str, ...]) -> Iterator[Finding]:
 
 
 class _Scale(NamedTuple):
-    """A depth scale, the share of pixels that agree between frames at it, and that at the own."""
+    """A depth scale, and how well neighbouring frames agree at it.
+
+    Attributes:
+        scale: Depth units in a metre.
+        share: Share of pixels that agree at this scale.
+        own_share: Share of pixels that agree at the recording's own scale.
+    """
 
     scale: float
     share: float
@@ -122,7 +138,7 @@ def _better_scale(poses: Poses | None, own: float, median: float) -> _Scale | No
 
 
 def _of_scale(median: float, own: float, better: _Scale | None) -> Iterator[Finding]:
-    """What the poses say, and else what the median depth, in metres, does; 0 says nothing."""
+    """A warning of a wrong depth scale, from the poses or else from the median depth, in metres."""
     low, high = _USUAL_DEPTHS
     if better is not None:
         yield Finding(

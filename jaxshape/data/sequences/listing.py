@@ -1,4 +1,4 @@
-"""What a folder holds, and which of its images belong together: by number, or by time."""
+"""The content of a folder, and the images that belong together, by number or by time."""
 
 import os
 import re
@@ -18,7 +18,13 @@ COLOR_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".ppm")
 
 
 class Contents(NamedTuple):
-    """A folder, listed once."""
+    """A folder, listed once.
+
+    Attributes:
+        folder: The folder.
+        files: Names of its files.
+        folders: Names of its sub-folders.
+    """
 
     folder: Path
     files: frozenset[str]
@@ -26,16 +32,24 @@ class Contents(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """What a layout finds in a folder, before any image is read."""
+    """Files that a layout finds in a folder, before any image is read.
+
+    Attributes:
+        files: Files of each frame.
+        depth_scale: Depth units in a metre.
+        read_pose: Index of a frame to its pose; None where the recording has no poses.
+        times: Times of the depth images, in seconds; None where they are not known.
+        color_delays: Seconds from a depth image to its colour image; None where they are not known.
+        camera: The camera of such recordings, for folders that hold none.
+        findings: Remarks that a user should know.
+    """
 
     files: tuple[FrameFiles, ...]
     depth_scale: float
     read_pose: Callable[[int], Float[np.ndarray, "4 4"] | None] | None = None
-    """None where the recording has no poses."""
     times: Float[np.ndarray, " n"] | None = None
     color_delays: Float[np.ndarray, " n"] | None = None
     camera: DefaultCamera | None = None
-    """Where the folder holds none."""
     findings: tuple[Finding, ...] = ()
 
 
@@ -90,7 +104,7 @@ def numbers_in(name: str) -> tuple[int, ...]:
 
 
 def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | None]:
-    """For each name the file of the same name, else that with the same numbers in its name."""
+    """For each name the file of the same name, else the one with the same numbers in its name."""
     by_number: dict[tuple[int, ...], Path | None] = {}
     for name, path in offered.items():
         by_number[numbers_in(name)] = None if numbers_in(name) in by_number else path

@@ -14,33 +14,49 @@ from jaxshape.files import write_text
 
 
 class Trajectory(NamedTuple):
-    """The way of a camera."""
+    """Poses of a camera over time.
+
+    Attributes:
+        T_world_camera: Camera to world `[n 4 4]`, rigid, in metres.
+        frames: Number of the frame, from 0, that each pose belongs to `[n]`.
+        times: Time of each pose `[n]`, in seconds; None where only the frames are known.
+    """
 
     T_world_camera: Float[np.ndarray, "n 4 4"]
     frames: Int[np.ndarray, " n"]
-    """Number of the frame, from 0, that each pose belongs to."""
     times: Float[np.ndarray, " n"] | None = None
-    """Seconds; None where only the frames are known."""
 
 
 class Pinhole(NamedTuple):
-    """The camera of a trajectory, as `.json` holds it."""
+    """The camera of a trajectory, as `.json` holds it.
+
+    Attributes:
+        intrinsics: Camera matrix `[3 3]`, in pixels, where column j covers u in [j, j + 1).
+        shape: Height and width of the images, in pixels.
+    """
 
     intrinsics: Float[np.ndarray, "3 3"]
-    """In pixels, where column j covers u in [j, j + 1)."""
     shape: tuple[int, int]
-    """Height and width, in pixels."""
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
-    """Read a trajectory; its suffix tells the format, and anything but these two is TUM's.
+    """Read a trajectory; the suffix of the file tells its format. [host]
 
-    `.log` (Redwood, Open3D): a line `frame frame frames`, then the 4x4 camera to world.
-    `.json` (Open3D's PinholeCameraTrajectory): 4x4 world to camera, by columns.
-    TUM: `time tx ty tz qx qy qz qw`, camera to world, a pose on each line; its poses are numbered
-    as they come. Poses that hold NaN, as some write them where they were lost, are left out.
+    - `.log` (Redwood, Open3D): a line `frame frame frames`, then the 4x4 camera to world.
+    - `.json` (Open3D's PinholeCameraTrajectory): 4x4 world to camera, by columns.
+    - Anything else is TUM's: `time tx ty tz qx qy qz qw`, camera to world, a pose on each line. Its
+      poses are numbered in their order.
 
-    Raises `SequenceError` where the file cannot be read, or a pose is not a rigid motion.
+    Poses that hold NaN, as some write them where tracking was lost, are left out.
+
+    Args:
+        path: The file to read.
+
+    Returns:
+        The poses, checked, with the numbers of their frames and, in the TUM format, their times.
+
+    Raises:
+        SequenceError: The file cannot be read, or a pose is not a rigid motion.
     """
     path = Path(path)
     read = {".log": _read_log, ".json": _read_json}.get(path.suffix.lower(), _read_tum)
@@ -62,10 +78,16 @@ def read_trajectory(path: str | Path) -> Trajectory:
 def write_trajectory(
     path: str | Path, trajectory: Trajectory, camera: Pinhole | None = None
 ) -> None:
-    """Write a trajectory in the format of its suffix, as `read_trajectory` reads it.
+    """Write a trajectory in the format of the suffix, as `read_trajectory` reads it. [host]
 
-    `.json` needs the `camera`, since Open3D does. TUM's has times; without, the numbers of the
-    frames take their place.
+    Args:
+        path: The file to write: `.log` or `.json` (Open3D), anything else for TUM's format.
+        trajectory: The poses; without times, the numbers of the frames take their place in TUM's
+            format.
+        camera: The camera, which `.json` needs; None for the other formats.
+
+    Raises:
+        ValueError: A `.json` file is asked for without a camera.
     """
     path = Path(path)
     suffix = path.suffix.lower()

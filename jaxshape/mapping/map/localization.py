@@ -25,12 +25,12 @@ _JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess
 def localize(
     state: MapState, prepared: PreparedFrame, config: TrackingConfig
 ) -> tuple[Alignment, str | None]:
-    """The pose of a frame in the world, and why it should not be believed.
+    """The pose of a frame in the world, and a reason against it.
 
     Args:
         state: The map; the frame is expected where the motion of the last frames goes on.
         prepared: The frame.
-        config: What the frame is aligned with, and when its pose is believed.
+        config: Settings of tracking.
 
     Returns:
         The alignment of the frame with the map; and a few words against it, None where there are
@@ -135,7 +135,7 @@ def has_moved(state: MapState, T_world_camera: jaxlie.SE3, config: MappingConfig
     Args:
         state: The map.
         T_world_camera: The pose of the frame.
-        config: How far a camera moves between keyframes.
+        config: Settings of mapping, with the distance and angle between keyframes.
 
     Returns:
         True where it turned, as it is or as seen from the object, or moved further than that.

@@ -51,15 +51,16 @@ from jaxshape.search.refiner import Refiner
 
 
 class Step(NamedTuple):
-    """What became of a frame.
+    """Outcome of one frame.
 
     Attributes:
         status: "keyframe", "tracked" or "lost".
-        reason: Why it was lost, in a few words; empty where it was not.
-        T_world_camera: Its pose; None where it was lost.
-        alignment: How it agrees with the map; None where the pose was given.
-        shape: As refined after a keyframe, a batch of one; None where nothing was refined.
-        seconds: What the parts took: "track", "cut", "fuse", "refine", "realign".
+        reason: Why the frame was lost, in a few words; empty where it was not.
+        T_world_camera: Pose of the frame; None where it was lost.
+        alignment: Agreement of the frame with the map; None where the pose was given.
+        shape: The shape as refined after a keyframe, a batch of one; None where nothing was
+            refined.
+        seconds: Seconds of each part: "track", "cut", "fuse", "refine", "realign".
     """
 
     status: str
@@ -73,10 +74,12 @@ class Step(NamedTuple):
 class Mapper(NamedTuple):
     """Functions over the state of a map, closed over a prior and settings.
 
+    A shape is None where nothing was measured in the box.
+
     Attributes:
-        init: `(prepared, box, T_world_camera, *, room=0.0, poses_are_given=False) -> state, step`:
-            the map of a first frame, whose object lies in `box`, in the world; the object is cut
-            out by a box larger by the share `room`.
+        init: `(prepared, box, T_world_camera, *, room=0.0, poses_are_given=False) -> state,
+            step`: the map of a first frame, whose object lies in `box`, in the world. The object is
+            cut out by a box larger by the share `room`.
         step: `(state, prepared, T_given=None, cut=None) -> state, step`: track a frame, unless its
             pose is given, and map it if it has moved enough. `cut(box, T_world_camera)` tells which
             pixels of a new keyframe may show the object, once its pose is known.
@@ -84,8 +87,6 @@ class Mapper(NamedTuple):
             box.
         finish: `state -> state, shape`: realign once more, and search as long as the settings
             allow.
-
-    A shape is None where nothing was measured in the box.
     """
 
     init: Callable[..., tuple[MapState, Step]]
@@ -95,14 +96,21 @@ class Mapper(NamedTuple):
 
 
 class _Parts(NamedTuple):
-    """What the functions of a mapper share; none of it changes."""
+    """What the functions of a mapper share; none of it changes.
+
+    Attributes:
+        prior: The shape prior.
+        key: Random key of the searches.
+        run_short: The search after each keyframe.
+        run_long: The search at the end.
+        mapping: Settings of mapping.
+        tracking: Settings of tracking.
+    """
 
     prior: ShapePrior
     key: Key[Array, ""]
     run_short: Callable[..., Reconstruction]
-    """The search after each keyframe."""
     run_long: Callable[..., Reconstruction]
-    """The search at the end."""
     mapping: MappingConfig
     tracking: TrackingConfig
 
@@ -116,15 +124,18 @@ def build_mapper(
     *,
     seed: int = 0,
 ) -> Mapper:
-    """Tracking and mapping with one prior and search; build it once, for its parts are compiled.
+    """Tracking and mapping with one prior and one search (paper, section 3.4). [host]
+
+    Build it once, for its parts are compiled.
 
     Args:
-        prior: Decoder, encoder and the distribution of the codes.
-        refiner: The search; None takes the encoder's proposal as it is.
-        search: Settings of the search at the end of a recording.
-        mapping: When a frame becomes a keyframe, and what is made of it.
+        prior: The shape prior.
+        refiner: The search (`refiner_for`); None takes the encoder's proposal as it is.
+        search: Settings of the search at the end of a recording; after each keyframe it is shorter,
+            `mapping.keyframe_iterations`.
+        mapping: When a frame becomes a keyframe, and how keyframes are fused.
         track: How the pose of a frame is found, and when it is believed.
-        seed: Of the random numbers of the search, 0 or more.
+        seed: Seed of the random numbers of the search, 0 or more.
 
     Returns:
         The four functions over the state of a map.

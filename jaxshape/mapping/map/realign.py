@@ -31,7 +31,7 @@ CORRELATION = 1 / 200
 in common."""
 
 SHAPE_CORRELATION = 1 / 1000
-"""The same of the patches of the refined shape, which is wrong by whole parts, not by patches."""
+"""Share of the patches of the refined shape that count as independent: it errs by whole parts."""
 
 _PATCH_DEVIATION = 0.002  # metres: of a keyframe's mean in a cell, however many points it has
 _ITERATIONS = 8
@@ -40,19 +40,30 @@ _PARALLEL = 0.8  # least cosine between the normals of a cell and of the refined
 
 
 class Odometry(NamedTuple):
-    """Each keyframe's pose relative to the one before it, as it was tracked."""
+    """Tracked pose of each keyframe relative to the one before it.
+
+    Attributes:
+        T_previous_keyframe: Pose of the keyframe in the frame of the one before it `[k]`.
+        information: Inverse covariance of that pose `[k 6 6]`, over translation and rotation in the
+            frame of the previous keyframe; 0 for none.
+    """
 
     T_previous_keyframe: jaxlie.SE3
     information: Float[Array, "k 6 6"]
-    """Over translation and rotation in the frame of the previous keyframe; 0 for none."""
 
 
 class _Observed(NamedTuple):
-    """What each keyframe sees in each cell that takes part."""
+    """Patches that each keyframe sees in each cell that takes part.
+
+    Attributes:
+        mean: Mean of the points of the keyframe in the cell, in metres.
+        variance: Variance of that mean along the normal, in square metres; infinite where the
+            keyframe sees nothing.
+        normal: Unit normal of the cell.
+    """
 
     mean: Float[Array, "c k 3"]
     variance: Float[Array, "c k"]
-    """Infinite where it sees nothing."""
     normal: Float[Array, "c 3"]
 
 
@@ -67,9 +78,18 @@ def realign(
 ) -> jaxlie.SE3:
     """The poses of the keyframes that agree best with each other, the shape and the odometry.
 
-    `clouds` holds the oriented points of each keyframe, in its camera's frame, padded to one
-    number; `is_keyframe` is False for padding. Fixed keyframes keep their poses; without one, the
-    whole map may drift. `predicted` is the surface of the refined shape.
+    Args:
+        clouds: Oriented points of each keyframe, in its camera's frame, padded to one number.
+        T_world_camera: Poses of the keyframes before `[k]`.
+        is_keyframe: False for padding `[k]`.
+        lattice: Cells in which keyframes are compared.
+        predicted: Surface of the refined shape.
+        odometry: Tracked poses between neighbouring keyframes.
+        is_fixed: True for keyframes that keep their poses `[k]`; without one, the whole map may
+            drift.
+
+    Returns:
+        Poses of the keyframes after `[k]`.
     """
     moves = is_keyframe & ~is_fixed
 
@@ -151,7 +171,7 @@ def _surface_equations(observed: _Observed, predicted: Surface, tolerance):
 
 
 def _heights_of_shape(predicted: Surface, middle, normal, tolerance):
-    """How high the refined shape lies over the middle of each cell, and the variance of that."""
+    """Height of the refined shape over the middle of each cell, and its variance."""
     cell = cell_of(predicted.lattice, middle)
     near = predicted.nearest.at[cell].get(mode="fill", fill_value=CELLS**3)
     q = predicted.points.at[near].get(mode="fill", fill_value=0.0)

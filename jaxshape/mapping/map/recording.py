@@ -35,29 +35,44 @@ PLACE_AGAIN = (2, 3, 5, 8, 13)
 
 
 class FrameLog(NamedTuple):
-    """What became of one frame."""
+    """Outcome of one frame of a recording.
+
+    Attributes:
+        index: Number of the frame in the recording, from 0.
+        name: Name of the frame, from its files.
+        status: "keyframe", "tracked", "lost" or "unreadable".
+        reason: Why the frame was lost or could not be read, in a few words; else empty.
+        keyframe: The keyframe, counted from 0, that the pose is relative to.
+        T_keyframe_camera: Pose of the frame relative to that keyframe `[4 4]`; None where it has no
+            pose.
+        figures: Inlier fraction, overlap, rmse in metres and conditioning of the alignment, and
+            seconds of each part (`seconds_track`, ...).
+    """
 
     index: int
     name: str
     status: str
-    """keyframe, tracked, lost or unreadable."""
     reason: str
     keyframe: int
-    """The keyframe, counted from 0, that the pose is relative to."""
     T_keyframe_camera: Float[np.ndarray, "4 4"] | None
-    """None where the frame has no pose."""
     figures: dict[str, float]
-    """Inlier fraction, overlap, rmse in metres and conditioning of the alignment, and seconds."""
 
 
 class Progress(NamedTuple):
-    """A map and what became of the frames so far."""
+    """A map and the outcome of the frames so far.
+
+    Attributes:
+        state: The map after the last frame.
+        start: The object as it was found in the first frame, with its latest box.
+        logs: Outcome of each frame so far.
+        shape: The shape as last refined, a batch of one; None where nothing was measured yet, or
+            where the progress of an earlier run was read.
+    """
 
     state: MapState
     start: Start
     logs: tuple[FrameLog, ...]
     shape: Reconstruction | None = None
-    """As last refined, a batch of one; None after an earlier run's progress was read."""
 
 
 def follow(
@@ -70,10 +85,22 @@ def follow(
     use_poses: bool = False,
     earlier: Progress | None = None,
 ) -> Iterator[Progress]:
-    """Track and map the chosen frames, by default all from the start's on; yields after each.
+    """Track and map the frames of a recording (paper, section 3.4). [host]
 
-    With `use_poses` the given poses are taken, and only frames without one are tracked. `earlier`
-    is the progress of a run that was cut short, after whose last frame this one goes on.
+    A damaged frame or a pose in doubt costs that frame alone and is written down in its `FrameLog`.
+
+    Args:
+        sequence: The recording, from `open_sequence`.
+        start: The object in the first frame, from `find_start`.
+        mapper: Tracking and mapping, from `build_mapper`.
+        prior: The shape prior, which estimates the object's box again as keyframes are added.
+        chosen: Numbers of the frames to use, rising; None for all from the start's on.
+        use_poses: Whether the given poses are used; then only frames without one are tracked.
+        earlier: Progress of a run that was cut short, after whose last frame this one goes on; None
+            to begin.
+
+    Yields:
+        The progress after each frame.
     """
     chosen = range(start.index, len(sequence)) if chosen is None else chosen
     progress = earlier or _begin(sequence, start, mapper, use_poses)
@@ -178,7 +205,15 @@ def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progr
 
 
 def trajectory(progress: Progress) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """T_world_camera of every frame that has a pose, from where its keyframe is now."""
+    """Poses of the frames of a recording, from where their keyframes are now. [host]
+
+    Args:
+        progress: Progress of a recording, from `follow`.
+
+    Returns:
+        `T_world_camera` `[4 4]` of every frame that has a pose, in metres, by the number of the
+        frame.
+    """
     poses = {}
     for log in progress.logs:
         if log.T_keyframe_camera is not None:

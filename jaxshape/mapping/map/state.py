@@ -23,24 +23,32 @@ _LEAST_CAPACITY = 8  # keyframes for which realigning is compiled, even where th
 
 
 class MapState(NamedTuple):
-    """All that the next step needs."""
+    """All that the next step needs.
+
+    Attributes:
+        keyframes: Keyframes so far, with their present poses.
+        place: Where the object's grids lie in the world.
+        measurement: Measurement fused from all keyframes.
+        sums: Sums of measured points in each cell, from which the measured surface is made.
+        code: Code of the shape as last refined `[d]`; the mean code before anything was measured.
+        logits: Logits of that shape `[x y z]`; -inf before anything was measured.
+        surface: The surface that frames are tracked against.
+        view: View of the last keyframe.
+        T_world_camera: Pose of the last frame that was tracked.
+        T_before_last: Motion of the camera to that frame from the one before.
+        poses_are_given: Whether the poses were given, so that keyframes are not realigned.
+    """
 
     keyframes: tuple[Keyframe, ...]
     place: Place
     measurement: Measurement
     sums: Sums
     code: Float[Array, " d"]
-    """Of the shape as last refined; the mean code before anything was measured."""
     logits: Float[Array, "x y z"]
-    """Its decoded shape; -inf before anything was measured."""
     surface: Surface
-    """What frames are tracked against."""
     view: DepthView
-    """Of the last keyframe."""
     T_world_camera: jaxlie.SE3
-    """Of the last frame that was tracked."""
     T_before_last: jaxlie.SE3
-    """How the camera moved to it from the frame before."""
     poses_are_given: bool
 
 
@@ -56,10 +64,18 @@ def assemble(
     T_before_last: jaxlie.SE3 | None = None,
     poses_are_given: bool = False,
 ) -> MapState:
-    """The state of a map with these keyframes, of whose last one `view` is.
+    """The state of a map with these keyframes.
 
-    `code` and `logits` are those of the shape found so far, `T_world_camera` the pose of the last
-    frame that was tracked and `T_before_last` the motion before it, where there was one since.
+    Args:
+        prior: The shape prior.
+        place: Where the object's grids lie in the world.
+        keyframes: The keyframes, one or more.
+        view: View of the last keyframe.
+        code: Code of the shape found so far `[d]`; None for the mean code.
+        logits: Logits of that shape `[x y z]`; None before anything was measured.
+        T_world_camera: Pose of the last frame that was tracked; None for that of the last keyframe.
+        T_before_last: Motion of the camera before that frame; None where there was none since.
+        poses_are_given: Whether the poses were given.
     """
     state = MapState(
         keyframes=keyframes,
@@ -117,14 +133,14 @@ def _add(measurement, sums, keyframe: Keyframe, T_object_world, frame, lattice):
 
 @partial(jax.jit, static_argnums=1)
 def grids_of(measurement: Measurement, min_hits: int):
-    """F and M."""
+    """F and M of a measurement."""
     return fusion.occupied(measurement, min_hits), fusion.occluded(measurement, min_hits)
 
 
 def odometry_of(
     state: MapState, T: jaxlie.SE3, alignment: Alignment | None
 ) -> tuple[jaxlie.SE3, Float[Array, "6 6"]]:
-    """The new keyframe relative to the last, and the information of that."""
+    """Pose of a new keyframe relative to the last one, and its inverse covariance."""
     T_last = state.keyframes[-1].T_world_camera
     information = jnp.zeros((6, 6))
     if alignment is not None:
@@ -154,7 +170,7 @@ def realigned(state: MapState) -> MapState:
 
 
 def realigned_poses(state: MapState) -> list[jaxlie.SE3]:
-    """Where the keyframes agree best with each other and with the refined shape."""
+    """Poses at which the keyframes agree best with each other and with the refined shape."""
     count = len(state.keyframes)
     capacity = capacity_for(count)
     filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - count)]
@@ -176,7 +192,7 @@ def capacity_for(count: int) -> int:
     """The number of keyframes for which realigning is compiled: the next power of two.
 
     Args:
-        count: How many there are, 1 or more.
+        count: Number of keyframes, 1 or more.
 
     Returns:
         8, 16, 32, ...: with each twice as large as the one before, a map that grows is compiled

@@ -1,1 +1,1 @@
-"""Where the object stands, how it is turned and how large it is, by what the prior explains."""
+"""Placement of the object, its position, orientation and size, by what the prior explains."""

@@ -25,10 +25,10 @@ SURE = 0.5
 """Confidence of a segmentation from which a frame may be the first."""
 
 SURE_OF_PROMPT = 0.1
-"""The same where the user said what to look at."""
+"""Confidence from which a frame may be the first where the user gave a prompt."""
 
 SURE_OF_FRONT = 0.01
-"""Nats per point by which a box that is turned otherwise must be worse."""
+"""Nats per point by which boxes turned otherwise must be worse for the front to be sure."""
 
 FIRST_FRAMES = 10
 """Frames among which the first that shows the object well is looked for."""
@@ -38,27 +38,35 @@ _ROOM = 0.15  # by which a box that was estimated is enlarged before the object 
 
 
 class Start(NamedTuple):
-    """The object as it was found in one frame, the first of the map."""
+    """The object as it was found in one frame, the first of the map.
+
+    Attributes:
+        index: Number of the frame in the recording, from 0.
+        masked: Pixels of that frame that show the object `[h w]`; None where the box alone tells.
+        box: The object's box in the world.
+        T_world_camera: Pose of the frame `[4 4]`.
+        T_level_world: World to a frame with the same origin and +y up `[4 4]`; None where the box
+            was given and stays.
+        floor: Height of the floor in the level frame, in metres; NaN where it is not known.
+        placement: The placement that the prior found, in the level frame; None where the box was
+            given.
+        notes: What was found and how sure that is, in sentences.
+        warnings: Those of the notes that a user should look at.
+    """
 
     index: int
-    """Of the frame."""
     masked: Bool[np.ndarray, "h w"] | None
-    """Pixels of that frame that show the object; None where the box alone tells."""
     box: Box
     T_world_camera: Float[np.ndarray, "4 4"]
     T_level_world: Float[np.ndarray, "4 4"] | None
-    """To a frame with the same origin and +y up; None where the box was given and stays."""
     floor: float
-    """Height of the floor in the level frame, in metres; NaN where it is not known."""
     placement: Placement | None
     notes: tuple[str, ...]
-    """What was found and how sure that is, in sentences."""
     warnings: tuple[str, ...]
-    """Those of the notes that a user should look at."""
 
 
 def room(start: Start) -> float:
-    """By how much the box is enlarged to cut out the object: not where it was given."""
+    """Share by which the box is enlarged to cut out the object: 0 where the box was given."""
     return 0.0 if start.T_level_world is None else _ROOM
 
 
@@ -71,13 +79,27 @@ def find_start(
     first: int = 0,
     use_pose: bool = True,
 ) -> Start:
-    """Find the object in the first frame that shows it well, from `first` on.
+    """Find the object in the first frame that shows it well. [host]
 
-    With a box nothing is searched for: it lies in the world of the given poses or, without these,
-    of the camera of the first frame. Else the object is cut out of the frame (`segment`) and placed
-    by the prior (`place`), upright on the floor if that is seen.
+    With a box nothing is searched for. Without one the object is cut out of the frame (`segment`)
+    and placed by the prior (`place`), upright on the floor if that is seen.
 
-    Raises `SequenceError` where no frame is good enough.
+    Args:
+        sequence: The recording, from `open_sequence`.
+        prior: The shape prior, of whose class the object is.
+        prompt: Where the object is in the image; `Prompt()` looks in the middle of several frames.
+        box: The object's box, in the world of the given poses or, without these, of the camera of
+            the first frame; None to find it.
+        first: Number of the first frame to look at, from 0.
+        use_pose: Whether the world is that of the given poses, where there are any.
+
+    Returns:
+        The frame, the pixels that show the object, and its box.
+
+    Raises:
+        SequenceError: No frame shows the object well enough, can be read, or has a pose where poses
+            are used.
+        ValueError: No pixel of the image can meet the prompt.
     """
     use_pose = use_pose and sequence.has_poses
     if box is not None:
@@ -217,7 +239,7 @@ def _rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def placed_again(start: Start, prior: ShapePrior, keyframes: tuple[Keyframe, ...]) -> Start:
-    """The start with its box estimated from all keyframes, from its earlier placement on."""
+    """The start with its box estimated from all keyframes, beginning at its earlier placement."""
     seen = [
         (one.depth, one.segmented, one.intrinsics, np.asarray(one.T_world_camera.as_matrix()))
         for one in keyframes

@@ -1,6 +1,6 @@
-"""Where an object stands, how it is turned and how large it is, found without hand work.
+"""The object's box, found without hand work: where it stands, how it is turned, how large it is.
 
-The paper (section 4.3) is given the first pose by hand. Here the prior says it: of many boxes
+The paper (section 4.2) is given the first pose by hand. Here the prior finds it: of many boxes
 around the measured points, the object's own is that in which the network explains them best. In a
 level world a box has seven numbers: its turn about the vertical and two opposite corners.
 
@@ -39,23 +39,30 @@ from jaxshape.search.space import whitened
 
 @dataclass(frozen=True)
 class PlacementConfig:
-    """How the object's box is searched for; the defaults are for chairs."""
+    """Settings of the search for the object's box; the defaults are for chairs.
+
+    Attributes:
+        typical_size: Usual extents of the object along x, y and z, in metres, above 0: the
+            geometric means of the procedural chairs.
+        size_spread: Standard deviations of the logarithms of the extents, above 0.
+        yaws: Directions of the front to start from, evenly spaced, 1 or more.
+        overhangs: Distances by which boxes reach beyond the measured points where they face away
+            from the camera, in typical sizes, 0 or more.
+        kept: Boxes that are improved, of all those proposed, 1 or more.
+        steps: Steps of Adam that improve each box, 1 or more.
+        steps_again: Steps of Adam where an earlier placement is known, 1 or more.
+
+    Raises:
+        ValueError: A setting is outside its range, or more boxes are kept than proposed.
+    """
 
     typical_size: tuple[float, float, float] = (0.58, 0.86, 0.60)
-    """Extents that are usual, in metres: the geometric means of the procedural chairs."""
     size_spread: tuple[float, float, float] = (0.34, 0.21, 0.29)
-    """Standard deviations of the logarithms of the extents."""
     yaws: int = 24
-    """Directions of the front to start from, evenly spaced."""
     overhangs: tuple[float, ...] = (0.0, 0.2, 0.5)
-    """How far a box reaches beyond the measured points where it faces away from the camera, in
-    typical sizes."""
     kept: int = 8
-    """Boxes that are improved, of all those proposed."""
     steps: int = 60
-    """Of their improvement."""
     steps_again: int = 25
-    """The same, where an earlier placement is known."""
 
     def __post_init__(self) -> None:
         for name in ("typical_size", "size_spread"):
@@ -76,7 +83,7 @@ COMPARED_POINTS = 2048
 """Points on the object that shapes are compared with."""
 
 FREE_WEIGHT = 3.0
-"""Of free points against measured ones: most are far from any surface, and say little."""
+"""Weight of free points against measured ones: most are far from any surface, and say little."""
 
 OUTSIDE_WEIGHT = 0.1
 """Nats for every voxel by which a measured point lies outside its box, up to four voxels."""
@@ -96,7 +103,13 @@ OTHERWISE = jnp.pi / 6
 
 
 class UprightBox(NamedTuple):
-    """An upright box: its corners in a frame that is turned by `yaw`, in radians, about +y."""
+    """An upright box: its corners in a frame that is turned about +y.
+
+    Attributes:
+        yaw: Turn of the frame about +y, in radians.
+        lower: Corner with the smallest coordinates in the turned frame, in metres.
+        upper: Corner with the largest coordinates in the turned frame, in metres.
+    """
 
     yaw: Float[Array, "*batch"]
     lower: Float[Array, "*batch 3"]
@@ -104,28 +117,38 @@ class UprightBox(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """A box and the shape in it."""
+    """A box and the shape in it.
+
+    Attributes:
+        box: The upright box.
+        point: Code of the shape, as a point of the whitened space.
+    """
 
     box: UprightBox
     point: Float[Array, "*batch d"]
-    """Of the code, in the whitened space."""
 
 
 class Placement(NamedTuple):
-    """The object's frame, box and first shape."""
+    """The object's frame, box and first shape.
+
+    Attributes:
+        T_world_object: Pose of the object frame: origin at the centre of the box, +y up, front
+            along +z.
+        size: Extents of the box along the axes of the object `[3]`, in metres.
+        code: Code of the shape that explains the points `[d]`.
+        misfit: Negative log-likelihood of the points, in nats per point; infinite where nothing
+            could be placed.
+        margin: Misfit of the best box that is turned otherwise, by over 30 degrees, less that of
+            this one, 0 or more. Below 0.01 the front is not to be trusted: the object is as good as
+            symmetric, or was seen from a side that does not tell. Infinite where no other box was
+            worth improving.
+    """
 
     T_world_object: jaxlie.SE3
-    """Origin at the centre of the box, +y up, front along +z."""
     size: Float[Array, " 3"]
-    """Extents of the box, in metres."""
     code: Float[Array, " d"]
-    """Of the shape that explains the points."""
     misfit: Float[Array, ""]
-    """Nats per point, see `misfit`; infinite where nothing could be placed."""
     margin: Float[Array, ""]
-    """By how much the misfit of the best box that is turned otherwise, by over 30 degrees, is
-    larger. Below 0.01 the front is not to be trusted: the object is as good as symmetric, or it was
-    seen from a side that does not tell. Infinite where no other box was worth improving."""
 
 
 # ------------------------------------------------------------------------ boxes
@@ -134,8 +157,13 @@ class Placement(NamedTuple):
 def propose(seen: RaySamples, floor: Float[Array, ""], config: PlacementConfig) -> UprightBox:
     """Boxes around the measured points: `overhangs * yaws` of them, yaw by yaw.
 
-    A side that faces the camera lies where the points end, one that faces away may lie beyond. The
-    bottom lies on the floor, at the height `floor`; where that is NaN, where the points end.
+    A side that faces the camera lies where the points end; one that faces away may lie beyond.
+
+    Args:
+        seen: Points on the object, and points that rays passed.
+        floor: Height of the floor, on which the bottom of the boxes lies, in metres; NaN where it
+            is not known: the bottom then lies where the points end.
+        config: Settings of the placement.
     """
     yaw = jnp.arange(config.yaws) * (2 * jnp.pi / config.yaws)
     ordered = jnp.sort(seen.surface @ turn(yaw), axis=1)
@@ -163,7 +191,7 @@ def turn(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
 
 
 def to_voxels(box: UprightBox, points: Float[Array, "n 3"], resolution: int) -> Float[Array, "n 3"]:
-    """Points in the voxel coordinates of the grid that the box fills."""
+    """Take points to the voxel coordinates of the grid that a box fills."""
     frame = grid.fit_box(box.lower, box.upper, resolution=resolution)
     return grid.voxel_from_object(frame, points @ turn(box.yaw))
 
@@ -174,11 +202,11 @@ def to_voxels(box: UprightBox, points: Float[Array, "n 3"], resolution: int) -> 
 def misfit(
     logits: Float[Array, "x y z"], box: UprightBox, seen: RaySamples, config: PlacementConfig
 ) -> Float[Array, ""]:
-    """How badly a shape in a box explains what was seen, in nats per point.
+    """Negative log-likelihood of the points given a shape in a box, in nats per point.
 
-    The negative log-likelihood of the measured points, that the shape is there, and of the free
-    points, that it is not, each a mean over points, and of the box's size. Differentiable in the
-    logits and in the box.
+    It sums three terms: the measured points, where the shape should be; the free points, where it
+    should not be, each a mean over points; and the size of the box. Differentiable in the logits
+    and in the box.
     """
     n = logits.shape[-1]
     surface, free = to_voxels(box, seen.surface[:COMPARED_POINTS], n), to_voxels(box, seen.free, n)
@@ -228,7 +256,14 @@ def improve(
     unit: Hypothesis,
     steps: Array | int,
 ) -> Hypothesis:
-    """Hypotheses after some steps of Adam, each on its own; `unit` is how far one step moves."""
+    """Take some steps of Adam with each hypothesis on its own.
+
+    Args:
+        start: Hypotheses to improve, a batch.
+        misfits: Misfit of each hypothesis.
+        unit: Length of one step in each number of a hypothesis.
+        steps: Steps of Adam.
+    """
     adam = optax.scale_by_adam(b2=0.98)
     after = lambda moves: jax.tree.map(lambda x, u, m: x + u * m, start, unit, moves)  # noqa: E731
     slope = jax.grad(lambda moves: jnp.sum(misfits(after(moves))))
@@ -251,11 +286,19 @@ def place(
     known: Placement,
     config: PlacementConfig = PlacementConfig(),
 ) -> Placement:
-    """Find the object in a level world, +y up, from what frames in it say.
+    """Find the box of an object in a level world, +y up, from what depth frames say of it.
 
-    `floor` is the height on which it stands, NaN where that is not known. `known` is an earlier
-    placement, which joins the boxes to improve, or `nothing_known(prior)`: the same program serves
-    both. Where `seen` is not finite the misfit is infinite.
+    The paper (section 4.2) is given the first pose by hand; here the box is found in which the
+    prior explains the points best.
+
+    Args:
+        prior: The shape prior.
+        seen: Points on the object and points that rays passed, in the level world; where they are
+            not finite the misfit is infinite.
+        floor: Height of the floor on which the object stands, in metres; NaN where it is not known.
+        known: An earlier placement, which joins the boxes to improve, or `nothing_known(prior)`:
+            the same program serves both.
+        config: Settings of the placement; the defaults are for chairs.
     """
     # A turn of a box must not sweep it through the world.
     center = jnp.median(seen.surface, axis=0)
@@ -298,7 +341,7 @@ def place(
 
 
 def nothing_known(prior: ShapePrior) -> Placement:
-    """Stands for an earlier placement where there is none."""
+    """The value that stands for an earlier placement where there is none."""
     unknown = jaxlie.SE3.identity()
     nan = jnp.float32(jnp.nan)
     return Placement(unknown, jnp.full(3, nan), jnp.full_like(prior.code_mean, nan), nan, nan)

@@ -1,7 +1,7 @@
-"""What depth frames say of the place of an object: points on it, and points that are free.
+"""Points on an object, and free points around it, from depth frames.
 
-Always the same number of them, however large the images are and however many: whatever compares
-boxes by them is compiled once.
+Their number is always the same, whatever the size and number of the images, so that functions of
+them are compiled once.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
 
 SURFACE_POINTS, FREE_POINTS = 8192, 4096
-"""Of each frame: points on the object, enough to fill a grid, and points that rays passed."""
+"""Numbers of points of each frame: on the object, enough to fill a grid, and passed by rays."""
 
 REACH = 1.2
 """Radius of the ball around the object in which rays count, in typical extents."""
@@ -26,15 +26,19 @@ and the thickness of a voxel."""
 
 
 class RaySamples(NamedTuple):
-    """What depth frames say of the place of an object."""
+    """Points on an object, and free points around it, from depth frames.
+
+    Attributes:
+        surface: Measured points of the object `[*batch n 3]`, in metres and in random order.
+        free: Points that were seen through `[*batch m 3]`, in metres, spread evenly over the free
+            rays around the object.
+        away: Direction from the camera to the object `[*batch 3]`; for several frames the mean of
+            the unit vectors, which is short where the object was seen from all sides.
+    """
 
     surface: Float[Array, "*batch n 3"]
-    """Measured points of the object, in metres and in random order."""
     free: Float[Array, "*batch m 3"]
-    """Points that were seen through, spread evenly over the free rays around the object."""
     away: Float[Array, "*batch 3"]
-    """The direction from the camera to the object; for several frames, the mean of the unit
-    vectors, so that it is short where the object was seen from all sides."""
 
 
 def sample_rays(
@@ -44,11 +48,20 @@ def sample_rays(
     intrinsics: Intrinsics,
     extent: float = 0.7,
 ) -> RaySamples:
-    """What one frame says, in the frame of its camera; the same number of points for every frame.
+    """Samples of one frame, in the frame of its camera; the same number of points for every frame.
 
-    `depth` is in metres, 0 where nothing is known and infinite where the ray met nothing;
-    `segmented` is True on the object, which measures some `extent` metres. All rays free space, as
-    far as they pass by the object. NaN where no segmented pixel has a depth.
+    All rays free space, as far as they pass by the object.
+
+    Args:
+        key: Random key of the samples.
+        depth: Depth image `[h w]`, in metres; 0 where nothing is known, infinite where the ray met
+            nothing.
+        segmented: True on pixels that show the object `[h w]`.
+        intrinsics: The camera.
+        extent: Rough size of the object, in metres.
+
+    Returns:
+        The samples; NaN where no segmented pixel has a depth.
     """
     surface_key, ray_key, depth_key = jax.random.split(key, 3)
     rays = camera.unproject(intrinsics, jnp.ones_like(depth)).reshape(-1, 3)
@@ -73,7 +86,7 @@ def sample_rays(
 def _through_ball(
     rays: Float[Array, "n 3"], center: Float[Array, " 3"], radius: float
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Where rays from the origin enter a ball and leave it, as factors; equal where they miss."""
+    """Factors at which rays from the origin enter a ball and leave it; equal where they miss."""
     squared = jnp.sum(rays**2, axis=-1)
     middle = rays @ center / squared
     half = jnp.sqrt(jnp.maximum(middle**2 - (center @ center - radius**2) / squared, 0))
@@ -81,7 +94,7 @@ def _through_ball(
 
 
 def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Array, " k"]:
-    """Indices drawn with replacement, in proportion to their weights; those of none never.
+    """Indices drawn with replacement, in proportion to their weights; those of weight 0 never.
 
     Weights are whole numbers, for rounding in a running sum would let any index be drawn.
     """
@@ -91,9 +104,16 @@ def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Arra
 
 
 def pooled(samples: RaySamples, T_world_camera: jaxlie.SE3) -> RaySamples:
-    """What the frames of a leading axis say together, in the world, in as many points as of one.
+    """Samples of several frames together, as many points as of one.
 
     Frames in which nothing was segmented are left out.
+
+    Args:
+        samples: Samples of the frames, along a leading axis, each in the frame of its camera.
+        T_world_camera: Poses of the frames.
+
+    Returns:
+        The samples in the world.
     """
     is_empty = jnp.isnan(samples.away[:, 0])
     frames = jnp.argsort(is_empty)  # the others first

@@ -1,1 +1,1 @@
-"""Which pixels of a depth frame show the object: planes, clusters, and the choice among them."""
+"""Segmentation of the object in a depth frame: planes, clusters, and the choice among them."""

@@ -1,4 +1,4 @@
-"""What a depth frame falls into once floor, walls and table tops are out of it. [host]"""
+"""Clusters of a depth frame once floor, walls and table tops are removed. [host]"""
 
 from typing import NamedTuple
 
@@ -34,10 +34,10 @@ FURNITURE = 1.5
 """A cluster longer than this, in metres, is not joined to one that is already chosen."""
 
 HIDDEN = 0.4
-"""How much of the height, in metres, between two parts of an object may be hidden."""
+"""Largest hidden gap in height between two parts of an object, in metres."""
 
 GROWTH = 0.1
-"""How far, in metres, legs may stand outside the footprint of what is above them."""
+"""Largest distance of legs outside the footprint of the parts above them, in metres."""
 
 SMALLEST = 12
 """Clusters of fewer pixels are noise."""
@@ -50,17 +50,21 @@ Pixel = tuple[float, float]
 
 
 class Scene(NamedTuple):
-    """A depth frame reduced to the working width, and its planes."""
+    """A depth frame reduced to the working width, and its planes.
+
+    Attributes:
+        stride: Of this many rows and columns of the frame, the middle one is kept.
+        points: Points in the camera frame, in metres; NaN where nothing was measured.
+        spacing: Distance between the rays of neighbouring pixels at a depth of 1 m, in metres.
+        planes: Dominant planes of the frame, largest first.
+        floor: The floor among them; None where no plane is sure to be the floor.
+    """
 
     stride: int
-    """Of this many rows and columns of the frame, the middle one is kept."""
     points: Float[np.ndarray, "h w 3"]
-    """Camera frame, metres; NaN where nothing was measured."""
     spacing: float
-    """Metres between the rays of neighbouring pixels, at a depth of 1 m."""
     planes: list[Plane]
     floor: Floor | None
-    """None where no plane is sure to be the floor."""
 
     @property
     def z(self) -> Float[np.ndarray, "h w"]:
@@ -85,7 +89,10 @@ def reduced(image: np.ndarray, stride: int) -> np.ndarray:
 
 
 def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> np.ndarray:
-    """A segmentation at full size: each pixel is as that, of those around it, nearest in depth."""
+    """A segmentation at full size.
+
+    Each pixel takes the value of that reduced pixel around it which is nearest in depth.
+    """
     (h, w), stride = segmented.shape, view.stride
     if stride == 1:
         return segmented
@@ -100,7 +107,7 @@ def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> 
     return found
 
 
-# What is not the object ------------------------------------------------------------------------
+# Background -----------------------------------------------------------------------------------
 
 
 def background(view: Scene, click: Pixel | None) -> Image:
@@ -180,7 +187,7 @@ def clusters(view: Scene, free: Image) -> Int[np.ndarray, "h w"]:
 def jumps(
     z: Float[np.ndarray, "h w"], other: Float[np.ndarray, "h w"], spacing: float
 ) -> Bool[np.ndarray, "h w"]:
-    """Whether two depths of neighbouring pixels are of two surfaces; noise and slopes are not."""
+    """Whether the depths of neighbouring pixels are of two surfaces; noise and slopes are not."""
     nearer = np.fmin(z, other)
     return np.abs(z - other) > tolerance(nearer) + 2.5 * spacing * nearer
 

@@ -1,4 +1,4 @@
-"""How sure a segmentation is: the product of what speaks for it, and a sentence. [host]"""
+"""Confidence of a segmentation: the product of the evidence for it, and a sentence. [host]"""
 
 import numpy as np
 from jaxtyping import Bool
@@ -17,9 +17,15 @@ def doubts_of(
     *,
     clicked: bool,
 ) -> list[Doubt]:
-    """What the segmented pixels say for or against themselves.
+    """Evidence for and against a segmentation.
 
     What was clicked on need not be seen to stand on a floor: its feet may be out of sight.
+
+    Args:
+        segmented: Pixels that were segmented.
+        behind: Pixels of the background.
+        view: The frame.
+        clicked: Whether the user clicked on the object.
     """
     hidden, touching = _outline(segmented, behind, view)
     size = float(np.linalg.norm(np.ptp(view.points[segmented], axis=0)))
@@ -55,7 +61,7 @@ def _outline(
 
 
 def _standing(segmented: Bool[np.ndarray, "h w"], view: Scene) -> float:
-    """How sure it is that the object stands on the floor; half where no floor is seen."""
+    """Confidence that the object stands on the floor; half where no floor is seen."""
     if view.floor is None:
         return 0.5
     floor = floor_plane(view.points.reshape(-1, 3), [view.floor.plane], view.points[segmented])

@@ -20,8 +20,8 @@ def feet_on(
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels that were taken for floor, but have the colour of the object above or beside them.
 
-    Shadows have its colour too, at times, but lie on the floor: a patch must on average be a little
-    above it. Empty where colours do not tell the object from the floor.
+    Shadows may have its colour too, but lie on the floor: a patch must on average be a little above
+    it. Empty where colours do not tell the object from the floor.
     """
     height = np.nan_to_num(height_above(floor, view.points) / tolerance(view.z), nan=9.0)
     flat = (np.abs(height) < 1.5) & ~segmented

@@ -24,30 +24,37 @@ NEIGHBOURS = 24
 """Points that a hypothesis is fitted to: half a metre of a wall three metres away."""
 
 REFINED = 6
-"""Of the hypotheses with most inliers, how many are refined: the first may lie across a corner."""
+"""Hypotheses that are refined, those with most inliers: the first may lie across a corner."""
 
 MAX_TILT = 65.0
 """Largest angle, in degrees, between the floor's normal and up in the image of a camera in hand."""
 
 
 class Plane(NamedTuple):
-    """The points `p` with `normal . p + offset = 0`."""
+    """The points `p` with `normal . p + offset = 0`.
+
+    Attributes:
+        normal: Unit vector towards the camera.
+        offset: Distance of the camera from the plane, in metres.
+        share: Share of the points that lie on the plane, from 0 to 1.
+    """
 
     normal: Float[np.ndarray, " 3"]
-    """Unit length, towards the camera."""
     offset: float
-    """Distance of the camera from the plane, metres."""
     share: float
-    """Share, from 0 to 1, of the points that lie on it."""
 
 
 class Floor(NamedTuple):
-    """The plane on which the object stands: `plane.normal` is up, `plane.offset` the height of the
-    camera above it."""
+    """The plane on which the object stands.
+
+    Attributes:
+        plane: The plane: `plane.normal` is up, `plane.offset` the height of the camera above it.
+        confidence: From 0 to 1: high where enough of the plane is seen, little lies below it, and
+            the object stands on it.
+    """
 
     plane: Plane
     confidence: float
-    """From 0 to 1: enough of it is seen, little lies below it, and the object stands on it."""
 
 
 def camera_points(
@@ -182,7 +189,7 @@ def _floor_evidence(
     points: Float[np.ndarray, "n 3"],
     object_points: Float[np.ndarray, "m 3"] | None,
 ) -> float:
-    """How likely, from 0 to 1, a level plane is the floor."""
+    """Evidence, from 0 to 1, that a level plane is the floor."""
     seen = min(1.0, plane.share / 0.05)
     lowest = nothing_below(plane, points)
     if object_points is None or len(object_points) == 0:

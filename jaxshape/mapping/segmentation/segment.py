@@ -1,4 +1,4 @@
-"""Which pixels of a depth frame show the object (paper, sections 3.1 and 4.3). [host]
+"""Segmentation of the object in a depth frame (paper, sections 3.1 and 4.2). [host]
 
 The paper thresholds depth by hand. Here the floor, the walls and table tops are taken out as
 planes; the rest falls apart into clusters where depth jumps; the cluster in the middle, or under a
@@ -32,7 +32,7 @@ from jaxshape.mapping.segmentation.confidence import Doubt, doubts_of, falling, 
 from jaxshape.mapping.segmentation.feet import feet_on
 
 CLICK_RADIUS = 4.0
-"""Pixels of the reduced image around a click that may be meant."""
+"""Radius around a click in which the object may lie, in pixels of the reduced image."""
 
 MOSTLY = 0.5
 """Share of a cluster that must lie in the object's box to be part of it."""
@@ -48,25 +48,36 @@ CANDIDATES = 5
 
 
 class Segmentation(NamedTuple):
-    """The pixels that show the object, and how sure that is."""
+    """The pixels that show the object, and the confidence in them.
+
+    Attributes:
+        segmented: True on pixels that show the object `[h w]`.
+        confidence: Confidence in the segmentation, from 0 to 1.
+        reason: One sentence: what was found, and what makes it unsure.
+    """
 
     segmented: Bool[np.ndarray, "h w"]
     confidence: float
-    """From 0 to 1."""
     reason: str
-    """One sentence: what was found, and what makes it unsure."""
 
 
 @dataclass(frozen=True)
 class Prompt:
-    """What a person says of where the object is; with nothing said it is sought in the middle."""
+    """A hint where the object is; without one it is sought in the middle of the image.
+
+    Attributes:
+        click: A point `(u, v)` of the image on the object, in pixels, 0 or more; None for no click.
+        region: `(left, top, right, bottom)` around the object, in pixels; None for the whole image.
+        depth_range: Nearest and farthest depth of the object, in metres, 0 or more; None for any
+            depth.
+
+    Raises:
+        ValueError: A coordinate is outside its range, or an interval is empty.
+    """
 
     click: tuple[float, float] | None = None
-    """A point `(u, v)` of the image, in pixels, on the object."""
     region: tuple[float, float, float, float] | None = None
-    """`(left, top, right, bottom)`, in pixels, around the object."""
     depth_range: tuple[float, float] | None = None
-    """Nearest and farthest depth of the object, in metres."""
 
     def __post_init__(self) -> None:
         for coordinate in self.click or ():
@@ -88,15 +99,24 @@ def segment(
     prompt: Prompt = Prompt(),
     mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Segmentation:
-    """The pixels of one frame that measure the object: by its mask, by a prompt, or on its own.
+    """Find the pixels of one frame that measure the object (paper, sections 3.1 and 4.2). [host]
 
-    `depth` is in metres, 0 or infinite where nothing was measured; such pixels are never segmented.
-    A given `mask`, True on the object, is taken as it is. Else what the prompt's depth range and
-    region leave is cleaned of floor, walls and table tops, and the cluster under the click, or the
-    one largest and nearest to the middle, is the object. A frame without depth, or without a
-    cluster, gives an empty segmentation of confidence 0 that says why.
+    A given mask is taken as it is. Without one, floor, walls and table tops are removed from the
+    pixels that the prompt allows, and the cluster under the click, or the one largest and nearest
+    to the middle, is the object. A frame without depth, or without a cluster, gives an empty
+    segmentation of confidence 0 that says why.
 
-    Raises `ValueError` for a prompt that no pixel can meet.
+    Args:
+        depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured. Such pixels
+            are never segmented.
+        color: Colour image `[h w 3]`, registered to the depth image, which tells feet from floor;
+            None where there is none.
+        K: Camera matrix `[3 3]`, in pixels.
+        prompt: Where the object is in the image.
+        mask: True on the object `[h w]`; None to find it.
+
+    Raises:
+        ValueError: No pixel of the image can meet the prompt.
     """
     check_prompt(prompt, depth.shape)
     measured = (depth > 0) & np.isfinite(depth)
@@ -127,11 +147,18 @@ def segment_inside(
     T_world_camera: Float[np.ndarray, "4 4"],
     others: Float[np.ndarray, "n 3"] = NOTHING,
 ) -> Bool[np.ndarray, "h w"]:
-    """The pixels of a later frame that show the object, of which a box is known.
+    """Find the pixels of a later frame that show the object, of which a box is known. [host]
 
-    Those of the clusters that lie mostly in the box, and mostly not where earlier frames saw other
-    things, at the points `others`: a table that reaches into the box is left out, and what the
-    object has outside of it is not lost. Box and points are in the world, in metres.
+    Clusters count that lie mostly in the box and mostly not where earlier frames saw other things:
+    a table that reaches into the box is left out, and parts of the object outside of it are not
+    lost.
+
+    Args:
+        depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
+        K: Camera matrix `[3 3]`, in pixels.
+        box: The object's box in the world.
+        T_world_camera: Pose of the frame `[4 4]`.
+        others: World points at which earlier frames saw other things `[n 3]`, in metres.
     """
     view = look(depth, K)
     known = np.isfinite(view.z)
@@ -190,7 +217,7 @@ def _prompted(prompt: Prompt, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarra
 
 
 def _target(prompt: Prompt, view: Scene) -> Pixel:
-    """Where in the reduced image, as row and column, the object is expected."""
+    """Row and column of the reduced image at which the object is expected."""
     h, w = view.z.shape
     if prompt.click is not None:
         u, v = prompt.click
@@ -224,10 +251,11 @@ def _nearest(labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel) -> tupl
 def _most_central(
     labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel
 ) -> tuple[list[int], Doubt]:
-    """Of the clusters, with what belongs to each, that which is worth most.
+    """The cluster, with what belongs to it, that has the highest worth.
 
-    Pixels count by a Gaussian window about the target, for the square root of their number, so that
-    what fills the image is worth little, and for less where the border of the image cuts them.
+    Pixels count by a Gaussian window about the target. Their sum is divided by the square root of
+    their number, so that what fills the image is worth little, and reduced where the border of the
+    image cuts the cluster.
     """
     row, column = np.indices(labels.shape)
     away = np.hypot(row - target[0], column - target[1]) / (0.2 * labels.shape[1])

@@ -33,23 +33,36 @@ _DAMPING = 1e-3  # of the largest eigenvalue: directions weaker than that are le
 
 
 class Cloud(NamedTuple):
-    """Oriented points to be aligned."""
+    """Oriented points to be aligned.
+
+    Attributes:
+        points: Points, in metres.
+        normals: Unit normals of the points.
+        deviation: Standard deviation of each point along its normal, in metres; infinite for no
+            point.
+    """
 
     points: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
     deviation: Float[Array, " n"]
-    """Standard deviation of each point along its normal, in metres; infinite for no point."""
 
 
 class Matches(NamedTuple):
-    """For each point, a place on the surface of one or several references."""
+    """For each point, a place on the surface of one or several references.
+
+    Attributes:
+        points: Places on the surface, in metres.
+        normals: Unit normals of the surface there.
+        deviation: Standard deviation of the place along its normal, in metres; infinite for no
+            match.
+        in_reach: Whether the reference looked at the place where the point lies, so that it should
+            have a match.
+    """
 
     points: Float[Array, "*references n 3"]
     normals: Float[Array, "*references n 3"]
     deviation: Float[Array, "*references n"]
-    """Standard deviation of that place along its normal, in metres; infinite for no match."""
     in_reach: Bool[Array, "*references n"]
-    """Whether the reference looked at the place where the point lies: it should have a match."""
 
 
 # Points and normals, in the frame of the references, and how far a match may lie, in metres.
@@ -57,22 +70,29 @@ Match = Callable[[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, ""] | f
 
 
 class Alignment(NamedTuple):
-    """The outcome of an alignment; nothing in it raises."""
+    """The outcome of an alignment; failure is a value of it, never an exception.
+
+    Attributes:
+        T_reference_source: Pose of the cloud in the reference frame.
+        inlier_fraction: Share of the points that the references should show that agree with them,
+            from 0 to 1.
+        overlap: Share of all points that the references should show, from 0 to 1.
+        rmse: Root mean square distance of inliers to the planes of their matches, in metres.
+        information: Inverse covariance of the pose `[6 6]`, over translation and rotation about the
+            reference's origin, in the reference frame; per square metre and square radian.
+        conditioning: Smallest eigenvalue of the normal equations over the largest, from 0, where a
+            motion is free, to 1.
+        converged: Whether the last step was small.
+        iterations: Steps that were taken.
+    """
 
     T_reference_source: jaxlie.SE3
     inlier_fraction: Float[Array, ""]
-    """Of the points that the references should show, those that agree with them."""
     overlap: Float[Array, ""]
-    """Of all points, those that the references should show."""
     rmse: Float[Array, ""]
-    """Of the distances of inliers to the planes of their matches, in metres."""
     information: Float[Array, "6 6"]
-    """Inverse covariance of the pose, over translation and rotation about the reference's origin,
-    in the reference frame; per metre and radian squared."""
     conditioning: Float[Array, ""]
-    """Smallest eigenvalue of the normal equations over the largest, 0 where a motion is free."""
     converged: Bool[Array, ""]
-    """Whether the last step was small."""
     iterations: Int[Array, ""]
 
 
@@ -133,8 +153,14 @@ def align(
 ) -> Alignment:
     """Move a cloud onto a reference, from a first guess of its pose.
 
-    `distance` is how far a match may lie, and `tolerance` a standard deviation added to those of
-    the points, both in metres: large ones for a rough guess, small ones to be exact.
+    Args:
+        cloud: The points to align.
+        match: Finds a match for each point.
+        T_reference_source: First guess of the pose.
+        distance: Largest distance of a match, in metres.
+        tolerance: Standard deviation added to those of the points, in metres: large for a rough
+            guess, small to be exact.
+        iterations: Steps at most.
     """
 
     def proceed(carry):
@@ -166,8 +192,19 @@ def align(
 
 
 class _System(NamedTuple):
-    """Normal equations over translation and rotation about `center`, rotation in units of 1 /
-    `radius` so that all six are lengths."""
+    """Normal equations of one step over translation and rotation.
+
+    Rotation has the unit 1 / `radius`, so that all six unknowns are lengths.
+
+    Attributes:
+        hessian: Matrix of the equations `[6 6]`.
+        gradient: Right side of the equations, with opposite sign `[6]`.
+        center: Point about which the cloud is rotated, the weighted mean of its points, in metres.
+        radius: Root mean square distance of the points from the centre, in metres.
+        inliers: Points that agree with a match.
+        in_reach: Points that should have a match.
+        rmse: Root mean square distance of inliers to the planes of their matches, in metres.
+    """
 
     hessian: Float[Array, "6 6"]
     gradient: Float[Array, " 6"]

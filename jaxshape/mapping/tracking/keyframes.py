@@ -1,4 +1,4 @@
-"""What the map keeps of frames, and where in the world the object's grids lie. [host]"""
+"""Frames as the map keeps them, and the place of the object's grids in the world. [host]"""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,11 +27,15 @@ _STRIDE = 2  # pixels between the points that a keyframe keeps
 
 
 class PreparedFrame(NamedTuple):
-    """One frame, prepared for tracking and mapping."""
+    """One frame, prepared for tracking and mapping.
+
+    Attributes:
+        view: Depth image at working size, with its oriented points.
+        masked: Pixels that may show the object `[h w]`: a given mask, or all.
+    """
 
     view: DepthView
     masked: Bool[Array, "h w"]
-    """Pixels that may show the object: a given mask, or all."""
 
 
 # Pixels that may show the object, from its box and the pose of the camera, both in the world.
@@ -39,29 +43,43 @@ Cut = Callable[[Box, jaxlie.SE3], Bool[Array, "h w"]]
 
 
 class Keyframe(NamedTuple):
-    """What the map keeps of a frame."""
+    """The part of a frame that the map keeps.
+
+    Attributes:
+        depth: Depth image `[h w]`, in metres; 0 where nothing is known, infinite where the ray met
+            nothing.
+        masked: Pixels that may show the object `[h w]`: a given mask, or all.
+        segmented: Pixels that show the object `[h w]`.
+        intrinsics: The camera.
+        cloud: Oriented points of the object, in the frame of the camera.
+        T_world_camera: Present pose of the keyframe.
+        T_previous_keyframe: Tracked pose relative to the keyframe before.
+        information: Inverse covariance of that relative pose `[6 6]`, in the frame of the keyframe
+            before; 0 for the first.
+    """
 
     depth: Float[Array, "h w"]
     masked: Bool[Array, "h w"]
-    """Pixels that may show the object: a given mask, or all."""
     segmented: Bool[Array, "h w"]
-    """Those that do."""
     intrinsics: Intrinsics
     cloud: Cloud
-    """Oriented points of the object, in the frame of the camera."""
     T_world_camera: jaxlie.SE3
     T_previous_keyframe: jaxlie.SE3
-    """Relative to the keyframe before, as it was tracked."""
     information: Float[Array, "6 6"]
-    """Of that relative pose, in the frame of the keyframe before; 0 for the first."""
 
 
 class Place(NamedTuple):
-    """Where the object's grids lie in the world."""
+    """Where the object's grids lie in the world.
+
+    Attributes:
+        box: The object's box.
+        cut: The box whose content is taken for the object.
+        frame: Voxel frame of the grids, in the object frame.
+        lattice: Cells of the surface, in the world.
+    """
 
     box: Box
     cut: Box
-    """What lies in it is taken for the object."""
     frame: GridFrame
     lattice: Lattice
 
@@ -69,7 +87,11 @@ class Place(NamedTuple):
 def place_of(box: Box, resolution: int, room: float = 0.0, *, isotropic: bool = False) -> Place:
     """The voxel frame of a resolution and the lattice of the surface that fill a box.
 
-    The object is cut out by a box that is larger by the share `room`.
+    Args:
+        box: The object's box in the world.
+        resolution: Voxels along each axis of the grids.
+        room: Share by which the box that cuts out the object is larger.
+        isotropic: Whether all axes have one scale.
     """
     fit = grid.fit_box_isotropic if isotropic else grid.fit_box
     frame = fit(jnp.float32(-box.size / 2), jnp.float32(box.size / 2), resolution=resolution)
@@ -88,15 +110,15 @@ def keyframe_of(
     odometry: tuple[jaxlie.SE3, Float[Array, "6 6"]] | None,
     segmented: Bool[Array, "h w"] | None = None,
 ) -> Keyframe:
-    """What the map keeps of a frame.
+    """The part of a frame that the map keeps.
 
     Args:
         prepared: The frame.
         place: Where the object's grids lie.
-        T_world_camera: The pose of the frame.
-        odometry: Its pose relative to the keyframe before, and the information of that; None for
-            the first.
-        segmented: The object's pixels; those in its box where they are not given.
+        T_world_camera: Pose of the frame.
+        odometry: Its pose relative to the keyframe before, and the inverse covariance of that pose;
+            None for the first.
+        segmented: The object's pixels; None for those in its box.
 
     Returns:
         The keyframe.
@@ -144,7 +166,13 @@ view_again = jax.jit(view_of)
 def prepare(
     frame: Frame, K: Float[np.ndarray, "3 3"], masked: Bool[np.ndarray, "h w"] | None = None
 ) -> PreparedFrame:
-    """A frame at working size, with its oriented points; `masked` in place of its own mask."""
+    """A frame at working size, with its oriented points.
+
+    Args:
+        frame: The frame.
+        K: Camera matrix `[3 3]`, in pixels.
+        masked: Pixels that may show the object, in place of its own mask; None for that mask.
+    """
     halvings = 0
     while frame.depth.shape[1] >> halvings > WORKING_WIDTH:
         halvings += 1
@@ -170,5 +198,5 @@ def resized(mask: Bool[np.ndarray, "h w"], shape: tuple[int, ...]) -> Bool[Array
 
 
 def as_pose(T: Float[np.ndarray, "4 4"]) -> jaxlie.SE3:
-    """A pose of the host in JAX."""
+    """A 4x4 matrix of NumPy as a pose in JAX."""
     return jaxlie.SE3.from_matrix(jnp.float32(T)).normalize()

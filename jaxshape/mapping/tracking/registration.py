@@ -15,14 +15,18 @@ from jaxshape.mapping.tracking.views import DepthView
 
 
 class Level(NamedTuple):
-    """One level of the registration, from coarse to fine."""
+    """One level of the registration, from coarse to fine.
+
+    Attributes:
+        stride: Pixels between neighbouring points, along both axes.
+        distance: Largest distance of a match, in metres.
+        tolerance: Standard deviation of the pose guessed so far, in metres.
+        iterations: Steps at most.
+    """
 
     stride: int
-    """Every how many pixels, along both axes, there is a point."""
     distance: float
-    """How far a match may lie, in metres."""
     tolerance: float
-    """Standard deviation of the pose guessed so far, in metres."""
     iterations: int
 
 
@@ -52,7 +56,7 @@ def register_from(
 
 
 def score(alignment: Alignment) -> Float[Array, "*batch"]:
-    """How well a view is explained: the inliers, less those that should have been but are not."""
+    """Share of points that agree, less the share that should agree but does not."""
     seen, agree = alignment.overlap, alignment.inlier_fraction
     return seen * agree - seen * (1 - agree)
 
@@ -95,8 +99,8 @@ def doubt(
     """Why a pose should not be believed. [host]
 
     Args:
-        alignment: How the frame was registered.
-        T_expected: The pose it was expected at; None where it may lie anywhere.
+        alignment: Outcome of the registration.
+        T_expected: The expected pose; None where the pose may lie anywhere.
         config: How much must be explained, and how far from the expected pose it may lie.
 
     Returns:

@@ -1,9 +1,9 @@
 """The surface of the map as small oriented patches, one for each cell of a grid.
 
-Two sources, one form. What keyframes measured is averaged in each cell, which is exact to a
-fraction of a millimetre; what the prior predicts is the middle of the decoded shell, exact to a
-fraction of a voxel. The standard deviations say so, and whoever aligns with the surface weighs by
-them.
+Patches of two sources have one form. Measured patches are averages of what keyframes measured in
+each cell, exact to a fraction of a millimetre; predicted patches lie in the middle of the decoded
+shell, exact to a fraction of a voxel. Their standard deviations say so, and are the weights of
+whatever is aligned with the surface.
 """
 
 from itertools import product
@@ -31,24 +31,36 @@ _PATCHES_BY_FACE = 4  # of a predicted surface at most, by voxels of a face of t
 
 
 class Lattice(NamedTuple):
-    """Where the cells lie: `cell = world @ linear.T + offset`."""
+    """Where the cells lie: `cell = world @ linear.T + offset`.
+
+    Attributes:
+        linear: Linear part `[3 3]`, in cells per metre.
+        offset: Cell coordinates of the world origin `[3]`.
+    """
 
     linear: Float[Array, "3 3"]
     offset: Float[Array, " 3"]
 
 
 class Surface(NamedTuple):
-    """Oriented patches in the world frame, at most one for each cell."""
+    """Oriented patches in the world frame, at most one for each cell.
+
+    Attributes:
+        lattice: Where the cells lie.
+        points: A point of each patch, in metres.
+        normals: Unit normal of each patch.
+        deviation: Standard deviation along the normal, in metres; infinite where the cell has no
+            patch.
+        two_sided: True where nothing tells which side is outside, as in predicted patches.
+        nearest: For each cell, the cell of a patch near to it; `c` where there is none in reach.
+    """
 
     lattice: Lattice
     points: Float[Array, "c 3"]
     normals: Float[Array, "c 3"]
     deviation: Float[Array, " c"]
-    """Along the normal, in metres; infinite where the cell has no patch."""
     two_sided: Bool[Array, " c"]
-    """True where nothing tells which side is outside, as of what is predicted."""
     nearest: Int[Array, " c"]
-    """For each cell, the cell of a patch near to it; `c` where there is none in reach."""
 
 
 def cell_of(lattice: Lattice, points: Float[Array, "*n 3"]) -> Int[Array, "*n"]:
@@ -63,14 +75,17 @@ def cell_size(lattice: Lattice) -> Float[Array, ""]:
 
 
 class Sums(NamedTuple):
-    """What measured points add up to in each cell; sums of sums are sums."""
+    """Sums of measured points in each cell; sums of sums are sums.
+
+    Attributes:
+        weight: Sum of inverse variances, per square metre.
+        point: Weighted sum of positions, from the centre of the cell.
+        normal: Weighted sum of normals.
+    """
 
     weight: Float[Array, " c"]
-    """Inverse variances."""
     point: Float[Array, "c 3"]
-    """Weighted, from the centre of the cell."""
     normal: Float[Array, "c 3"]
-    """Weighted."""
 
 
 def no_sums() -> Sums:
@@ -156,7 +171,7 @@ def predicted_surface(lattice: Lattice, completed: Float[Array, "x y z"]) -> Sur
 
 
 def composed_surface(measured: Surface, predicted: Surface) -> Surface:
-    """What was measured where it was, what is predicted elsewhere."""
+    """Measured patches where there are any, predicted ones elsewhere."""
     is_measured = jnp.isfinite(measured.deviation)
 
     def choose(x, y):

@@ -20,13 +20,19 @@ _TAPS = (0.06, 0.25, 0.38, 0.25, 0.06)  # of the smoothing, along each axis
 
 
 class DepthView(NamedTuple):
-    """A depth image, and the oriented points it measures, in the frame of its camera."""
+    """A depth image, and the oriented points it measures, in the frame of its camera.
+
+    Attributes:
+        depth: Depth as measured `[h w]`, in metres; 0 where nothing is known, infinite where the
+            ray met nothing.
+        points: Points of the smoothed depth image `[h w 3]`, in metres.
+        normals: Unit normals towards the camera `[h w 3]`; 0 where the image does not tell.
+        intrinsics: The camera.
+    """
 
     depth: Float[Array, "h w"]
-    """As measured: metres, 0 where nothing is known, infinite where the ray met nothing."""
     points: Float[Array, "h w 3"]
     normals: Float[Array, "h w 3"]
-    """Of unit length and towards the camera; 0 where the image does not tell."""
     intrinsics: Intrinsics
 
 

@@ -11,11 +11,11 @@ from jaxshape.search.refiner import Refiner
 
 
 def build_refiner(name: str, dim: int, config: RefineConfig) -> Refiner:
-    """The search of that name.
+    """Build a search by its name.
 
     Args:
         name: `family` or `family:variant`, as in "cma", "cma:ipop" and "gradient:adam", or
-            `package.module:function`, the import path of a function that is given
+            `package.module:function`, the import path of a function that takes
             `(variant, dim, config)`.
         dim: Numbers in a point of the search space, 1 or more.
         config: Settings of the search.

@@ -42,14 +42,14 @@ def cma(
     """CMA-ES over points of `dim` numbers, starting from N(point, sigma0^2 I).
 
     To start from another covariance, search in another space (`space.py`). `resume` keeps mean,
-    sigma and C of an earlier search; its paths led down another objective. With an own loop, or an
-    objective outside of JAX, use `cma_start`, `cma_ask` and `cma_tell`.
+    sigma and C of an earlier search, but not its paths, which led down another objective. For your
+    own loop, or an objective outside of JAX, use `cma_start`, `cma_ask` and `cma_tell`.
 
     Args:
         dim: Numbers in a point, 1 or more.
         sigma0: First standard deviation, above 0, in units of the search space.
         population: Candidates per iteration, 3 or more; None for pycma's 4 + floor(3 ln dim).
-        tolerances: When the search is over.
+        tolerances: Stop criteria that end the search.
 
     Returns:
         The search.

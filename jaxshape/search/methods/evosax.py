@@ -48,16 +48,25 @@ MULTIPLES = (
     dict.fromkeys(FOLLOW_A_GRADIENT | {"CR_FM_NES", "SV_CMA_ES"}, 2)  # mirrored candidates
     | {"SV_Open_ES": 4}
 )
-"""What the population of a strategy is a multiple of."""
+"""Numbers of which the population of a strategy must be a multiple."""
 
 
 class EvosaxState(NamedTuple):
-    """The strategy's own state, and where it lies in the search space."""
+    """The strategy's own state, and where it lies in the search space.
+
+    Attributes:
+        mean: Centre of the distribution `[d]`.
+        best: The best candidate so far.
+        stop: Always RUNNING, since evosax has no stop criteria.
+        origin: The first point `[d]`, zero of the strategy's coordinates.
+        evaluations: Evaluations of the objective so far, the start included.
+        strategy_state: State of the evosax strategy.
+    """
 
     mean: Float[Array, " d"]
     best: Candidate
-    stop: Int[Array, ""]  # evosax has no criteria: always RUNNING
-    origin: Float[Array, " d"]  # the first point: zero of the strategy's coordinates
+    stop: Int[Array, ""]
+    origin: Float[Array, " d"]
     evaluations: Int[Array, ""]
     strategy_state: Any
 
@@ -88,10 +97,10 @@ def evosax_strategy(
     learning rate. Losses that are not finite count as the worst finite one.
 
     Args:
-        name: One of evosax's distribution-based strategies.
+        name: Name of one of evosax's distribution-based strategies.
         dim: Numbers in a point, 1 or more.
-        population: Candidates per iteration. Strategies that mirror their candidates want an even
-            number; `SV_CMA_ES` and `SV_Open_ES` divide it between two populations.
+        population: Candidates per iteration, 1 or more. Strategies that mirror their candidates
+            need an even number; `SV_CMA_ES` and `SV_Open_ES` divide it between two populations.
         sigma0: Standard deviation of the first candidates, above 0, in units of the search space.
         **settings: Arguments of the strategy's constructor, for example
             `optimizer=optax.adam(0.1)`.

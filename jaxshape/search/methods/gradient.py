@@ -42,7 +42,8 @@ LIKE_PLAIN_DESCENT = {
     "schedule_free_sgd",
     "sgd",
 }
-"""Optimisers whose steps are as short as the gradient, and want the step size of plain descent."""
+"""Optimisers whose steps are as short as the gradient, so that they need the step size of plain
+descent."""
 
 LEARNING_RATE = 0.1
 """Learning rate of the other optimisers that have none of their own, in either space; most of them
@@ -70,7 +71,17 @@ UNUSABLE = {
 
 
 class GradientState(NamedTuple):
-    """The current iterate, the optimiser's own state, and the best point that was evaluated."""
+    """The current iterate, the optimiser's own state, and the best point that was evaluated.
+
+    Attributes:
+        mean: The current iterate `[d]`, which may not have been evaluated.
+        best: The best candidate so far.
+        stop: Why the search ended, as a `StopReason`; RUNNING while it goes on.
+        optimizer_state: State of the optax optimiser.
+        evaluations: Evaluations of the objective so far, the start included.
+        last_loss: Loss of the iteration before.
+        still: Iterations in a row that changed the loss by less than the tolerance.
+    """
 
     mean: Float[Array, " d"]
     best: Candidate
@@ -78,7 +89,7 @@ class GradientState(NamedTuple):
     optimizer_state: optax.OptState
     evaluations: Int[Array, ""]
     last_loss: Float[Array, ""]
-    still: Int[Array, ""]  # iterations in a row that changed the loss by less than the tolerance
+    still: Int[Array, ""]
 
 
 def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
@@ -146,10 +157,10 @@ def gradient(
     same step fails every time, the search stays there.
 
     Args:
-        optimizer: Of optax, or a number above 0 for plain descent with that step size (0.14 in the
-            paper).
+        optimizer: An optax optimiser, or a number above 0: the step size of plain descent (paper:
+            0.14).
         tolerance: The search ends when the loss has changed by less than this for `patience` steps
-            in a row; 0 never ends it.
+            in a row, 0 or more, in the units of the loss; 0 never ends it.
         patience: Steps in a row, 1 or more.
 
     Returns:

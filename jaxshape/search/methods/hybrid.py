@@ -1,8 +1,8 @@
 """CMA-ES first, then descent along the gradient from the best it found: `hybrid`, `hybrid:adam`.
 
-The population finds the basin, the gradient its floor: far from the encoder's guess gradients
-stall, and near a minimum a population of 17 needs hundreds of evaluations for what one gradient
-shows. By default the polish is by L-BFGS.
+The population finds the basin of a minimum and the gradient finds its floor. Far from the encoder's
+guess gradients stall, and near a minimum a population of 17 needs hundreds of evaluations for what
+one gradient shows. The second search is L-BFGS by default.
 """
 
 from typing import Any, NamedTuple
@@ -22,13 +22,23 @@ POLISH = 0.2
 
 
 class HybridState(NamedTuple):
-    """The two searches, of which one is at work."""
+    """The two searches, of which one is active.
+
+    Attributes:
+        mean: Where the active search stands `[d]`.
+        best: The best candidate so far.
+        stop: Why the search ended, as a `StopReason`; RUNNING while it goes on.
+        searched: State and trace of the first search.
+        polished: State of the second search.
+        polishing: Whether the second search is active.
+        iterations: Iterations so far, of both searches.
+    """
 
     mean: Float[Array, " d"]
     best: Candidate
     stop: Int[Array, ""]
-    searched: tuple[Any, Trace]  # of the first search
-    polished: Any  # of the second
+    searched: tuple[Any, Trace]
+    polished: Any
     polishing: Bool[Array, ""]
     iterations: Int[Array, ""]
 
@@ -46,15 +56,15 @@ def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
     """One search, then another one from the best point that it found.
 
     Args:
-        search: The first search, until it stops.
-        polish: The second search.
+        search: The first search, which runs until it stops or has used its iterations.
+        polish: The second search, which starts from the best point of the first.
         iterations: Iterations of the first search at most, 1 or more.
 
     Returns:
         Both as one search.
 
     Raises:
-        ValueError: `iterations` is no whole number from 1 up.
+        ValueError: `iterations` is not a whole number, or is below 1.
     """
     whole("iterations", iterations, 1)
 
