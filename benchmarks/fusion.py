@@ -66,7 +66,7 @@ def chair_frame() -> Frame:
     """A chair before a wall, as a Kinect sees it; a twentieth of the pixels know nothing."""
     mesh = js.random_chair(FIRST_CHAIR)
     T = js.orbit(1, DISTANCE)
-    seen = js.capture(mesh, T, noise=False, seed=0, image_size=WIDTH)
+    seen = js.capture(mesh, T, noise=False, seed=0, camera=js.VirtualCamera(WIDTH, WIDTH, None))
     edge = (WIDTH - HEIGHT) // 2
     depth = np.array(seen.depth[0, edge:-edge])
     segmented = np.isfinite(depth)

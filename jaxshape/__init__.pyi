@@ -2,6 +2,7 @@ from .data.capture import Capture, capture, measure_frames
 from .data.chairs import random_chair
 from .data.meshes import load, read_meshes
 from .data.sequences import Trajectory, open_sequence, read_trajectory, write_trajectory
+from .data.virtual_cameras import CAMERAS, SensorNoise, VirtualCamera
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
@@ -39,6 +40,7 @@ from .search.space import LatentSpace, raw, whitened
 from .search.stopping import Tolerances
 
 __all__ = [
+    "CAMERAS",
     "Architecture",
     "Capture",
     "Distribution",
@@ -58,6 +60,7 @@ __all__ = [
     "Refined",
     "Refiner",
     "Segmentation",
+    "SensorNoise",
     "ShapePrior",
     "Shot",
     "StopReason",
@@ -66,6 +69,7 @@ __all__ = [
     "Trace",
     "TrackingConfig",
     "Trajectory",
+    "VirtualCamera",
     "Weights",
     "bounds",
     "build_mapper",

@@ -11,6 +11,7 @@ import trimesh
 from jaxtyping import Array, Bool, Float
 
 from jaxshape.data import meshes, render
+from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.fusion import Measurement
@@ -18,6 +19,11 @@ from jaxshape.geometry.grid import GridFrame
 
 SURFACE_SAMPLES = 50_000
 """Points sampled on a CAD model to find its surface voxels: some 15 for each of them."""
+
+PAPER = CAMERAS["paper"]
+
+GRID_MARGIN = grid.RESOLUTION / (grid.RESOLUTION - 2 * grid.MARGIN) - 1
+"""By how much the object's grid is larger than the object, as a share of its size."""
 
 
 class Capture(NamedTuple):
@@ -38,25 +44,36 @@ def capture(
     *,
     noise: bool,
     seed: int,
-    image_size: int = render.IMAGE_SIZE,
+    camera: VirtualCamera = PAPER,
 ) -> Capture:
     """Look at a canonical mesh from some poses, and find its surface voxels.
 
     The ground truth comes straight from points on the CAD model, not through the depth frames, so
     that it is complete (paper, section 2.3).
+
+    Args:
+        mesh: In the object frame, centred, metres.
+        T_object_camera: One pose per view; `camera_distance` says how far away the camera stands.
+        noise: Whether the images have the faults of the camera's sensor.
+        seed: Of the noise, and of the points on the surface.
+        camera: Of its images, the window that can show the object's grid is kept.
+
+    Returns:
+        The depth images, and the grid's frame and true surface voxels.
     """
-    intrinsics = render.fit_intrinsics(mesh, T_object_camera, image_size)
-    depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, image_size)
+    intrinsics, size = render.window(camera, mesh, T_object_camera, GRID_MARGIN)
+    depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, size)
     if noise:
-        depth = render.add_sensor_noise(depth, cosine, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        depth = render.add_sensor_noise(depth, cosine, rng, camera.noise)
     frame = grid.fit_box(*jnp.float32(mesh.bounds))
     points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
     return Capture(depth, intrinsics, T_object_camera, frame, discretize(points, frame))
 
 
-def camera_distance(mesh: trimesh.Trimesh) -> float:
+def camera_distance(mesh: trimesh.Trimesh, camera: VirtualCamera = PAPER) -> float:
     """How far from the object's centre the virtual camera stands, in metres."""
-    return render.DISTANCE * float(mesh.scale)
+    return camera.distance * float(mesh.scale)
 
 
 @jax.jit

@@ -1,0 +1,140 @@
+"""Depth frames to signed distances on a fine grid (Curless and Levoy, SIGGRAPH 1996).
+
+One frame gives a `DistanceField`; two fields of the same object merge into one. Merging adds, so
+that it is associative and commutative up to rounding, with `nothing_measured()` as its identity:
+frames can be added one at a time, all at once, or cumulatively. Unlike points counted into voxels,
+distances average a sensor's noise away.
+
+Two things keep thin parts alive. Behind a surface, where a frame knows nothing, its distances count
+only within a narrow band and less with every millimetre, so that a plate seen from both sides keeps
+both. And what rays passed through is counted apart, so that the rays that pass beside a leg do not
+pull at its surface.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+from jax import lax
+
+from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.geometry.pixels import Sensor, surface_pixels
+
+FINE = 3
+"""Fine voxels along each side of a voxel of the shape."""
+
+
+class DistanceField(NamedTuple):
+    """What a set of frames says about each fine voxel.
+
+    Attributes:
+        weighted_distance: Sum over frames of weight times signed distance, in metres; positive in
+            front of the surface, negative behind it.
+        weight: Sum over frames of the weight of a measured surface nearby: 1 for one pixel that
+            looks straight at a surface 1 m away.
+        free: Sum over frames of the certainty, 0 to 1, that a ray passed through the voxel.
+    """
+
+    weighted_distance: Float[Array, "*batch x y z"]
+    weight: Float[Array, "*batch x y z"]
+    free: Float[Array, "*batch x y z"]
+
+
+def nothing_measured(resolution: int = FINE * RESOLUTION) -> DistanceField:
+    """The field of no frames."""
+    return DistanceField(*[jnp.zeros((resolution,) * 3)] * 3)
+
+
+def fine_frame(frame: GridFrame, resolution: int = FINE * RESOLUTION) -> GridFrame:
+    """The frame of the fine grid that covers the same box as a grid of shapes."""
+    return frame._replace(voxel_size=frame.voxel_size * (RESOLUTION / resolution))
+
+
+def measure(
+    depth: Float[Array, "h w"],
+    segmented: Bool[Array, "h w"],
+    intrinsics: Intrinsics,
+    T_object_camera: jaxlie.SE3,
+    frame: GridFrame,
+    sensor: Sensor = Sensor(),
+    resolution: int = FINE * RESOLUTION,
+) -> DistanceField:
+    """Signed distances from the surface that one depth frame shows.
+
+    Every fine voxel looks up the pixel that its centre projects to, so that a pixel is a patch and
+    a coarse image leaves no holes. Its distance is that to the plane through the pixel's surface.
+
+    Args:
+        depth: Metres; 0 where nothing is known, infinite where the ray met nothing.
+        segmented: True on pixels that show the object. Others make no surface; every valid pixel
+            frees the space in front of it.
+        intrinsics: Of the depth image.
+        T_object_camera: Camera to object.
+        frame: Of the grid of shapes, 32 voxels along each side.
+        sensor: How its noise grows, which decides weights and bands.
+        resolution: Fine voxels along each side.
+
+    Returns:
+        The field of this frame alone.
+    """
+    fine = fine_frame(frame, resolution)
+    pixels = surface_pixels(depth, segmented, intrinsics, sensor)
+    R, t = T_object_camera.rotation().as_matrix(), T_object_camera.translation()
+    K = jnp.stack(
+        [
+            jnp.array([intrinsics.fx, 0.0, intrinsics.cx]),
+            jnp.array([0.0, intrinsics.fy, intrinsics.cy]),
+            jnp.array([0.0, 0.0, 1.0]),
+        ]
+    )
+    pixel_from_voxel = K @ (R.T * fine.voxel_size)
+    shift = K @ (R.T @ (fine.origin - t))
+    center = jnp.arange(resolution) + 0.5
+    u, v, z = (
+        a * center[:, None, None] + (b * center[:, None] + (c * center + d))
+        for (a, b, c), d in zip(pixel_from_voxel, shift, strict=True)
+    )
+    h, w = depth.shape
+    inverse = 1 / jnp.maximum(z, 1e-6)
+    u, v = u * inverse, v * inverse
+    inside = (z > 0) & (u >= 0) & (u < w) & (v >= 0) & (v < h)
+    index = jnp.where(inside, v.astype(jnp.int32) * w + u.astype(jnp.int32), 0)
+    measured, slope = (x.ravel()[index] for x in pixels)
+    return _field(jnp.where(inside, measured, 0), slope, z, fine, sensor)
+
+
+def _field(measured, slope, z, fine: GridFrame, sensor: Sensor) -> DistanceField:
+    """The field from what each voxel looked up, and its own depth."""
+    size = jnp.max(fine.voxel_size)
+    sigma = sensor.axial * z**2
+    ahead = measured - z  # along the optical axis
+    distance = ahead * slope
+    front, behind = jnp.maximum(3 * size, 3 * sigma), jnp.maximum(1.8 * size, 2.0 * sigma)
+    fading = jnp.clip(1 + distance / behind, 0, 1)  # behind the surface
+    near = (slope > 0) & (distance < front)
+    weight = jnp.where(near, slope * fading / (z * z * z * z), 0)
+    certainty = jnp.where(slope > 0, distance, ahead) / jnp.maximum(size, 2 * sigma)
+    free = jnp.where(measured > 0, jnp.clip(certainty, 0, 1), 0)
+    return DistanceField(jnp.where(near, weight * distance, 0), weight, free)
+
+
+def merge(first: DistanceField, second: DistanceField) -> DistanceField:
+    """The field of both sets of frames."""
+    return DistanceField(*(a + b for a, b in zip(first, second, strict=True)))
+
+
+def merge_all(frames: DistanceField) -> DistanceField:
+    """Merge the leading axis of frames."""
+    return DistanceField(*(x.sum(axis=0) for x in frames))
+
+
+def merge_cumulative(frames: DistanceField) -> DistanceField:
+    """Merge the first 1, 2, ... frames of the leading axis; entry k holds frames 0 to k."""
+    return DistanceField(*(jnp.cumsum(x, axis=0) for x in frames))
+
+
+def mean_distance(field: DistanceField) -> Float[Array, "*batch x y z"]:
+    """Signed distance to the surface in metres; 0 where no surface was measured nearby."""
+    return field.weighted_distance / jnp.where(field.weight > 0, field.weight, 1)
