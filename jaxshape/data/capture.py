@@ -1,6 +1,7 @@
 """One object seen by the virtual camera: depth frames, measurements, ground truth. [host]"""
 
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -12,8 +13,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.data import meshes, render
 from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
-from jaxshape.geometry import fusion, grid
+from jaxshape.geometry import distance, fusion, grid
 from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import GridFrame
 
@@ -89,3 +91,25 @@ def measure_frames(captured: Capture) -> Measurement:
     measure = partial(fusion.measure, intrinsics=captured.intrinsics, frame=captured.frame)
     one = lambda depth, T: measure(depth, jnp.isfinite(depth), T_object_camera=T)  # noqa: E731
     return jax.vmap(one)(depth, captured.T_object_camera)
+
+
+def fuse_frames(captured: Capture, frames: tuple[int, ...]) -> DistanceField:
+    """Signed distances fused from the first k frames, for each k of an increasing tuple.
+
+    Frames are added one at a time, so that one field at a time is in memory, besides those asked
+    for; every pixel that hit something shows the object.
+    """
+
+    def add(field: DistanceField, frame: tuple[Array, jaxlie.SE3]) -> tuple[DistanceField, None]:
+        depth, T = frame
+        one = distance.measure(
+            depth, jnp.isfinite(depth), captured.intrinsics, T, captured.frame
+        )
+        return distance.merge(field, one), None
+
+    depth, field, found = jnp.asarray(captured.depth), distance.nothing_measured(), []
+    for first, last in pairwise((0, *frames)):
+        some = jax.tree.map(lambda x: x[first:last], (depth, captured.T_object_camera))
+        field, _ = jax.lax.scan(add, field, some)
+        found.append(field)
+    return jax.tree.map(lambda *x: jnp.stack(x), *found)

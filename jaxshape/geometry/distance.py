@@ -20,9 +20,9 @@ from jax import lax
 
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.grid import RESOLUTION, GridFrame
-from jaxshape.geometry.pixels import Sensor, surface_pixels
+from jaxshape.geometry.pixels import Sensor, pack, surface_pixels, unpack
 
-FINE = 3
+FINE = 4
 """Fine voxels along each side of a voxel of the shape."""
 
 
@@ -97,12 +97,16 @@ def measure(
         for (a, b, c), d in zip(pixel_from_voxel, shift, strict=True)
     )
     h, w = depth.shape
-    inverse = 1 / jnp.maximum(z, 1e-6)
+    inverse = 1 / z
     u, v = u * inverse, v * inverse
     inside = (z > 0) & (u >= 0) & (u < w) & (v >= 0) & (v < h)
-    index = jnp.where(inside, v.astype(jnp.int32) * w + u.astype(jnp.int32), 0)
-    measured, slope = (x.ravel()[index] for x in pixels)
-    return _field(jnp.where(inside, measured, 0), slope, z, fine, sensor)
+    index = jnp.where(inside, v.astype(jnp.int32) * w + u.astype(jnp.int32), h * w)
+    # The last entry stands for all that lies outside the image. A scatter writes it: XLA fuses
+    # nothing across scatters, where otherwise it would fit a plane for every voxel.
+    packed = jnp.append(pack(pixels), jnp.uint32(0))
+    packed = packed.at[jnp.array([h * w, h * w])].set(jnp.uint32(0))
+    found = unpack(packed.at[index].get(mode="promise_in_bounds"))
+    return _field(found.depth, found.slope, z, fine, sensor)
 
 
 def _field(measured, slope, z, fine: GridFrame, sensor: Sensor) -> DistanceField:
@@ -114,7 +118,7 @@ def _field(measured, slope, z, fine: GridFrame, sensor: Sensor) -> DistanceField
     front, behind = jnp.maximum(3 * size, 3 * sigma), jnp.maximum(1.8 * size, 2.0 * sigma)
     fading = jnp.clip(1 + distance / behind, 0, 1)  # behind the surface
     near = (slope > 0) & (distance < front)
-    weight = jnp.where(near, slope * fading / (z * z * z * z), 0)
+    weight = jnp.where(near, slope * fading / (1 + (sigma / sensor.floor) ** 2), 0)
     certainty = jnp.where(slope > 0, distance, ahead) / jnp.maximum(size, 2 * sigma)
     free = jnp.where(measured > 0, jnp.clip(certainty, 0, 1), 0)
     return DistanceField(jnp.where(near, weight * distance, 0), weight, free)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxshape.geometry.camera import Intrinsics
 
@@ -21,9 +22,11 @@ class Sensor:
 
     Attributes:
         axial: Standard deviation of depth, in metres at 1 m; grows with the square of depth.
+        floor: Errors that do not grow with depth, in metres: of calibration and of poses.
     """
 
     axial: float = 1.6e-3
+    floor: float = 3e-3
 
     def __post_init__(self) -> None:
         if not self.axial >= 0:
@@ -41,8 +44,8 @@ class SurfacePixels(NamedTuple):
             no surface.
     """
 
-    depth: Float[Array, "h w"]
-    slope: Float[Array, "h w"]
+    depth: Float[Array, "*n"]
+    slope: Float[Array, "*n"]
 
 
 def surface_pixels(
@@ -64,9 +67,8 @@ def surface_pixels(
     nearest = inverse
     for other, _, _ in _neighbours(inverse, 1):
         valid = other >= 0
-        differs = jnp.abs(other - inverse) > tolerance
-        jump |= valid & differs
-        same = valid & ~differs
+        jump |= valid & (other - inverse > tolerance)
+        same = valid & (jnp.abs(other - inverse) <= tolerance)
         total += jnp.where(same, other, 0)
         count += same
         nearest = jnp.maximum(nearest, other)
@@ -90,6 +92,24 @@ def surface_pixels(
     measured = jnp.where(known, 1 / jnp.where(shown > 0, shown, 1), 0)
     measured = jnp.where(known & (shown == 0), jnp.inf, measured)
     return SurfacePixels(measured, jnp.where(surface, slope, 0))
+
+
+SLOPE_BITS = 8
+"""Of the 32 that hold a pixel: 15 of the mantissa are left for depth, 0.06 mm at 2 m."""
+
+
+def pack(pixels: SurfacePixels) -> UInt32[Array, "*n"]:
+    """Depth with the slope in its last bits, so that one look-up finds both."""
+    steps = 2**SLOPE_BITS - 1
+    bits = lax.bitcast_convert_type(pixels.depth, jnp.uint32)
+    return (bits & ~jnp.uint32(steps)) | jnp.rint(pixels.slope * steps).astype(jnp.uint32)
+
+
+def unpack(packed: UInt32[Array, "*n"]) -> SurfacePixels:
+    """The pixels that were packed."""
+    steps = jnp.uint32(2**SLOPE_BITS - 1)
+    depth = lax.bitcast_convert_type(packed & ~steps, jnp.float32)
+    return SurfacePixels(depth, (packed & steps).astype(jnp.float32) / steps.astype(jnp.float32))
 
 
 def _neighbours(image: Float[Array, "h w"], step: int):

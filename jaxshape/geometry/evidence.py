@@ -1,0 +1,103 @@
+"""How likely each voxel of a shape is surface, free or unknown, from its fine signed distances.
+
+The numbers below were fitted to procedural chairs under a Kinect's noise, after 1 to 18 frames: how
+often a voxel with so many crossings, or so much free space, holds a piece of the true surface.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxshape.geometry.distance import DistanceField, mean_distance
+from jaxshape.geometry.grid import RESOLUTION
+
+OUTVOTED = 0.06
+"""A surface counts where its weight is more than this share of the rays that passed through it."""
+
+ALREADY, SCALE = 2.0, 4.5
+"""Fine voxels crossed by the surface, n, make a voxel surface with 1 - exp(-(n + 2) / 4.5)."""
+
+SOME, ALL = 0.5, 0.95
+"""Shares of free fine voxels from which a voxel begins to be free, and is free for certain."""
+
+FOUND = 0.45
+"""Voxels of the measurement grid are surface with at least this probability: one crossing."""
+
+SEEN = 0.5
+"""Voxels are free with at least this probability, else occluded: 72 % of them are seen through."""
+
+
+class Evidence(NamedTuple):
+    """What the frames say about each voxel; the rest of the probability is unknown.
+
+    Attributes:
+        surface: Probability, 0 to 1, that the voxel holds a piece of the measured surface.
+        free: Probability, 0 to 1, that it was seen to be free; both add up to 1 at most.
+    """
+
+    surface: Float[Array, "*batch x y z"]
+    free: Float[Array, "*batch x y z"]
+
+
+def evidence(field: DistanceField) -> Evidence:
+    """Probabilities of the voxels of a shape, 32 along each side, from a fused field."""
+    trusted = is_trusted(field)
+    crossed = crossings(field)
+    ahead = (field.free > 0.5) | (trusted & (field.weighted_distance > 0))
+    free, crossed = _share(ahead & ~crossed), _count(crossed)
+    surface = jnp.where(crossed > 0, 1 - jnp.exp(-(crossed + ALREADY) / SCALE), 0)
+    return Evidence(surface, (1 - surface) * jnp.clip((free - SOME) / (ALL - SOME), 0, 1))
+
+
+def is_trusted(field: DistanceField) -> Bool[Array, "*batch x y z"]:
+    """Fine voxels whose distance counts: a surface was measured nearby and few rays contradict."""
+    return (field.weight > 0) & (field.weight > OUTVOTED * field.free)
+
+
+def crossings(field: DistanceField) -> Bool[Array, "*batch x y z"]:
+    """Fine voxels that the surface crosses: of each pair with different signs, the nearer to it."""
+    trusted, distance = is_trusted(field), mean_distance(field)
+    crossed = jnp.zeros(distance.shape, bool)
+    for axis in (-3, -2, -1):
+        size = distance.shape[axis]
+        (t0, d0), (t1, d1) = (
+            [lax.slice_in_dim(x, i, size - 1 + i, axis=axis) for x in (trusted, distance)]
+            for i in (0, 1)
+        )
+        cross = t0 & t1 & ((d0 > 0) != (d1 > 0))
+        first = jnp.abs(d0) <= jnp.abs(d1)
+        crossed |= _pad(cross & first, axis, (0, 1)) | _pad(cross & ~first, axis, (1, 0))
+    return crossed
+
+
+def occupied(evidence: Evidence) -> Bool[Array, "*batch x y z"]:
+    """The measurement grid **F**: voxels that are surface more likely than a threshold."""
+    return evidence.surface > FOUND
+
+
+def occluded(evidence: Evidence) -> Bool[Array, "*batch x y z"]:
+    """The occlusion mask **M**: voxels that are neither surface nor free."""
+    return ~occupied(evidence) & (evidence.free < SEEN)
+
+
+def _pad(x: Bool[Array, "*batch x y z"], axis: int, width: tuple[int, int]) -> Array:
+    widths = [(0, 0)] * x.ndim
+    widths[axis] = width
+    return jnp.pad(x, widths)
+
+
+def _blocks(x: Bool[Array, "*batch x y z"]) -> Array:
+    """The fine voxels of each voxel on axes of their own, behind those of the voxels."""
+    *batch, n, _, _ = x.shape
+    k = n // RESOLUTION
+    return x.reshape(*batch, RESOLUTION, k, RESOLUTION, k, RESOLUTION, k)
+
+
+def _count(x: Bool[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+    return jnp.sum(_blocks(x), axis=(-5, -3, -1), dtype=jnp.float32)
+
+
+def _share(x: Bool[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+    return _count(x) / (x.shape[-1] // RESOLUTION) ** 3
