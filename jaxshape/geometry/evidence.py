@@ -22,6 +22,11 @@ ALREADY, SCALE = 2.0, 4.5
 SOME, ALL = 0.5, 0.95
 """Shares of free fine voxels from which a voxel begins to be free, and is free for certain."""
 
+HIDDEN, DEEP, SURE = 0.25, 0.25, 0.1
+"""Half of the voxels just behind a measured surface hold some more of it, or its other side: a
+quarter is put down to the measurement. A quarter of their fine voxels must lie behind, and fewer do
+where weights are large and the surface is known to be elsewhere."""
+
 FOUND = 0.45
 """Voxels of the measurement grid are surface with at least this probability: one crossing."""
 
@@ -43,11 +48,13 @@ class Evidence(NamedTuple):
 
 def evidence(field: DistanceField) -> Evidence:
     """Probabilities of the voxels of a shape, 32 along each side, from a fused field."""
-    trusted = is_trusted(field)
-    crossed = crossings(field)
+    trusted, crossed = is_trusted(field), crossings(field)
     ahead = (field.free > 0.5) | (trusted & (field.weighted_distance > 0))
-    free, crossed = _share(ahead & ~crossed), _count(crossed)
-    surface = jnp.where(crossed > 0, 1 - jnp.exp(-(crossed + ALREADY) / SCALE), 0)
+    behind = trusted & ~ahead & ~crossed
+    depth_of_proof = _sum(jnp.where(behind, field.weight, 0)) / jnp.maximum(_sum(behind), 1)
+    hidden = HIDDEN * jnp.minimum(_share(behind) / DEEP, 1) / (1 + (depth_of_proof / SURE) ** 2)
+    count, free = _within_margin(_sum(crossed)), _share(ahead & ~crossed)
+    surface = jnp.where(count > 0, 1 - jnp.exp(-(count + ALREADY) / SCALE), hidden)
     return Evidence(surface, (1 - surface) * jnp.clip((free - SOME) / (ALL - SOME), 0, 1))
 
 
@@ -72,6 +79,23 @@ def crossings(field: DistanceField) -> Bool[Array, "*batch x y z"]:
     return crossed
 
 
+def _within_margin(count: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+    """Crossings in the outermost voxels, which the box leaves free, as of those next to them.
+
+    The box's own faces lie a hundredth of a voxel inside: noise alone takes a surface across.
+    """
+    for axis in (-3, -2, -1):
+        first, second = (lax.slice_in_dim(count, i, i + 1, axis=axis) for i in (0, 1))
+        last, before = (
+            lax.slice_in_dim(count, RESOLUTION - i, RESOLUTION - i + 1, axis=axis) for i in (1, 2)
+        )
+        inner = lax.slice_in_dim(count, 2, RESOLUTION - 2, axis=axis)
+        empty = jnp.zeros_like(first)
+        parts = [empty, first + second, inner, before + last, empty]
+        count = jnp.concatenate(parts, axis=axis)
+    return count
+
+
 def occupied(evidence: Evidence) -> Bool[Array, "*batch x y z"]:
     """The measurement grid **F**: voxels that are surface more likely than a threshold."""
     return evidence.surface > FOUND
@@ -88,16 +112,16 @@ def _pad(x: Bool[Array, "*batch x y z"], axis: int, width: tuple[int, int]) -> A
     return jnp.pad(x, widths)
 
 
-def _blocks(x: Bool[Array, "*batch x y z"]) -> Array:
+def _blocks(x: Array) -> Array:
     """The fine voxels of each voxel on axes of their own, behind those of the voxels."""
     *batch, n, _, _ = x.shape
     k = n // RESOLUTION
     return x.reshape(*batch, RESOLUTION, k, RESOLUTION, k, RESOLUTION, k)
 
 
-def _count(x: Bool[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+def _sum(x: Array) -> Array:
     return jnp.sum(_blocks(x), axis=(-5, -3, -1), dtype=jnp.float32)
 
 
-def _share(x: Bool[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
-    return _count(x) / (x.shape[-1] // RESOLUTION) ** 3
+def _share(x: Array) -> Array:
+    return _sum(x) / (x.shape[-1] // RESOLUTION) ** 3

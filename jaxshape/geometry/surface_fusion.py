@@ -1,0 +1,147 @@
+"""One mesh of what was measured and what was decoded, at the resolution of the fine grid. [host]
+
+The measured surface is where the fused signed distance changes its sign. Where nothing was
+measured, decoded logits stand for a distance. From the edge of what was measured its distance is
+carried on, and fades out over a voxel and a half, so that both surfaces meet without a step.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import trimesh
+from jaxtyping import Array, Bool, Float
+from scipy import ndimage
+from skimage.measure import marching_cubes
+
+from jaxshape.geometry import evidence, grid
+from jaxshape.geometry.distance import DistanceField, mean_distance
+from jaxshape.geometry.grid import RESOLUTION, GridFrame
+
+REACH = 1.5
+"""Voxels over which measured distances fade out beyond the edge of what was measured."""
+
+NATS = 1.5
+"""Logits of the decoded surface: above 0, for occupied voxels reach beyond the surface they hold."""
+
+NATS_PER_VOXEL = 6.0
+"""How steeply logits rise across a decoded surface."""
+
+FLOOR = 1.0
+"""Voxels above the lowest occupied height within which a loose piece stands on the floor."""
+
+
+class FusedSurface(NamedTuple):
+    """A mesh, and where it comes from.
+
+    Attributes:
+        mesh: In the object frame, metres; normals point outwards.
+        measured: True for vertices on the measured surface, False for predicted ones.
+        dropped: How many loose pieces were left out.
+    """
+
+    mesh: trimesh.Trimesh
+    measured: Bool[np.ndarray, " n"]
+    dropped: int
+
+
+def fuse_surface(
+    field: DistanceField, logits: Float[Array | np.ndarray, "x y z"], frame: GridFrame
+) -> FusedSurface:
+    """The measured surface, completed by the decoded shape where nothing was measured.
+
+    Args:
+        field: Of one object.
+        logits: Its decoded shape, 32 voxels along each side.
+        frame: Of the decoded grid, in the object frame.
+
+    Returns:
+        A closed mesh, except for loose pieces that touch neither the largest piece nor the floor.
+
+    Raises:
+        ValueError: Where neither a surface was measured nor a shape decoded.
+    """
+    distance, trusted = combine(field, np.asarray(logits))
+    if not (distance < 0).any():
+        raise ValueError(
+            "There is no surface: nothing was measured inside the box and no logit is above "
+            f"{NATS}. Check the box and the segmentation."
+        )
+    padded = np.pad(distance, 1, constant_values=max(distance.max(), 1e-3))  # closed at the border
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent")
+    vertices -= 0.5  # of the padded grid, whose first centre is at -0.5
+    fine = len(distance)
+    at = np.clip(np.rint(vertices - 0.5), 0, fine - 1).astype(int)
+    scale = RESOLUTION / fine * np.asarray(frame.voxel_size, np.float64)
+    mesh = trimesh.Trimesh(
+        np.asarray(frame.origin, np.float64) + vertices * scale, faces, process=False
+    )
+    if mesh.volume < 0:
+        mesh.invert()
+    return _without_loose_pieces(mesh, trusted[tuple(at.T)], float(frame.voxel_size[1]))
+
+
+def combine(
+    field: DistanceField, logits: Float[np.ndarray, "x y z"]
+) -> tuple[Float[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
+    """Signed distances of the whole shape, in fine voxels, and where they were measured."""
+    measured, trusted, free = jax.device_get(_measured(field))
+    fine = len(measured)
+    scale = fine // RESOLUTION
+    voxel = float(np.abs(measured[trusted]).max(initial=1e-3)) / (3 * scale)
+    decoded = _upsample((NATS - logits) / NATS_PER_VOXEL * scale, scale).clip(-3.0, 3.0)
+    if not trusted.any():
+        return decoded, trusted
+    away, nearest = ndimage.distance_transform_edt(~trusted, return_indices=True)
+    carried_on = (measured / voxel)[tuple(nearest)].clip(-3.0, 3.0)
+    share = np.clip(1 - away / (REACH * scale), 0, 1)
+    distance = share * carried_on + (1 - share) * decoded
+    distance = np.where(free & ~trusted, np.maximum(distance, 1.0), distance)
+    smooth = ndimage.gaussian_filter(distance, 1.0)
+    distance = np.where(trusted, measured / voxel, smooth)
+    return _filled(distance, free), trusted
+
+
+@jax.jit
+def _measured(field: DistanceField) -> tuple[Array, Array, Array]:
+    return mean_distance(field), evidence.is_trusted(field), field.free > 0.5
+
+
+def _upsample(coarse: Float[np.ndarray, "x y z"], scale: int) -> Float[np.ndarray, "X Y Z"]:
+    """Linear between voxel centres, constant beyond the outermost."""
+    at = (np.arange(scale * len(coarse)) + 0.5) / scale - 0.5
+    for axis in range(3):
+        low = np.clip(np.floor(at).astype(int), 0, coarse.shape[axis] - 2)
+        share = np.clip(at - low, 0, 1).reshape([-1 if i == axis else 1 for i in range(3)])
+        coarse = (1 - share) * np.take(coarse, low, axis) + share * np.take(coarse, low + 1, axis)
+    return coarse
+
+
+def _filled(
+    distance: Float[np.ndarray, "X Y Z"], free: Bool[np.ndarray, "X Y Z"]
+) -> Float[np.ndarray, "X Y Z"]:
+    """The shape without cavities: shells hide the inside of solids, which no frame sees."""
+    outside = np.pad(distance > 0, 1, constant_values=True)
+    labels, count = ndimage.label(outside)
+    seen = np.bincount(labels[1:-1, 1:-1, 1:-1][free & (distance > 0)], minlength=count + 1) > 0
+    seen[labels[0, 0, 0]] = True
+    cavity = (labels > 0) & ~seen[labels]
+    return np.where(cavity[1:-1, 1:-1, 1:-1], -1.0, distance)
+
+
+def _without_loose_pieces(
+    mesh: trimesh.Trimesh, measured: Bool[np.ndarray, " n"], voxel: float
+) -> FusedSurface:
+    """Keep the largest piece, and those that stand on the floor with it."""
+    labels = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))
+    area = np.bincount(labels[mesh.faces[:, 0]], weights=mesh.area_faces)
+    lowest = np.full(len(area), np.inf)
+    np.minimum.at(lowest, labels, mesh.vertices[:, 1])
+    main = int(np.argmax(area))
+    keep = lowest < mesh.vertices[:, 1].min() + FLOOR * voxel
+    keep[main] = True
+    vertex = keep[labels]
+    index = np.cumsum(vertex) - 1
+    faces = index[mesh.faces[vertex[mesh.faces[:, 0]]]]
+    kept = trimesh.Trimesh(mesh.vertices[vertex], faces, process=False)
+    return FusedSurface(kept, measured[vertex], int((~keep).sum()))
