@@ -22,11 +22,6 @@ ALREADY, SCALE = 2.0, 4.5
 SOME, ALL = 0.5, 0.95
 """Shares of free fine voxels from which a voxel begins to be free, and is free for certain."""
 
-HIDDEN, DEEP, SURE = 0.25, 0.25, 0.1
-"""Half of the voxels just behind a measured surface hold some more of it, or its other side: a
-quarter is put down to the measurement. A quarter of their fine voxels must lie behind, and fewer do
-where weights are large and the surface is known to be elsewhere."""
-
 FOUND = 0.45
 """Voxels of the measurement grid are surface with at least this probability: one crossing."""
 
@@ -50,11 +45,8 @@ def evidence(field: DistanceField) -> Evidence:
     """Probabilities of the voxels of a shape, 32 along each side, from a fused field."""
     trusted, crossed = is_trusted(field), crossings(field)
     ahead = (field.free > 0.5) | (trusted & (field.weighted_distance > 0))
-    behind = trusted & ~ahead & ~crossed
-    depth_of_proof = _sum(jnp.where(behind, field.weight, 0)) / jnp.maximum(_sum(behind), 1)
-    hidden = HIDDEN * jnp.minimum(_share(behind) / DEEP, 1) / (1 + (depth_of_proof / SURE) ** 2)
     count, free = _within_margin(_sum(crossed)), _share(ahead & ~crossed)
-    surface = jnp.where(count > 0, 1 - jnp.exp(-(count + ALREADY) / SCALE), hidden)
+    surface = jnp.where(count > 0, 1 - jnp.exp(-(count + ALREADY) / SCALE), 0)
     return Evidence(surface, (1 - surface) * jnp.clip((free - SOME) / (ALL - SOME), 0, 1))
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from jaxshape.geometry import evidence, grid
+from jaxshape.geometry import evidence
 from jaxshape.geometry.distance import DistanceField, mean_distance
 from jaxshape.geometry.grid import RESOLUTION, GridFrame
 
@@ -26,6 +26,9 @@ NATS = 1.5
 
 NATS_PER_VOXEL = 6.0
 """How steeply logits rise across a decoded surface."""
+
+DEEP = 1.5
+"""Fine voxels behind a surface down to which its distances are taken as they are."""
 
 FLOOR = 1.0
 """Voxels above the lowest occupied height within which a loose piece stands on the floor."""
@@ -61,7 +64,9 @@ def fuse_surface(
     Raises:
         ValueError: Where neither a surface was measured nor a shape decoded.
     """
-    distance, trusted = combine(field, np.asarray(logits))
+    fine = field.weight.shape[-1]
+    scale = RESOLUTION / fine * np.asarray(frame.voxel_size, np.float64)
+    distance, measured = combine(field, np.asarray(logits), float(scale.max()))
     if not (distance < 0).any():
         raise ValueError(
             "There is no surface: nothing was measured inside the box and no logit is above "
@@ -70,41 +75,44 @@ def fuse_surface(
     padded = np.pad(distance, 1, constant_values=max(distance.max(), 1e-3))  # closed at the border
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent")
     vertices -= 0.5  # of the padded grid, whose first centre is at -0.5
-    fine = len(distance)
     at = np.clip(np.rint(vertices - 0.5), 0, fine - 1).astype(int)
-    scale = RESOLUTION / fine * np.asarray(frame.voxel_size, np.float64)
     mesh = trimesh.Trimesh(
         np.asarray(frame.origin, np.float64) + vertices * scale, faces, process=False
     )
     if mesh.volume < 0:
         mesh.invert()
-    return _without_loose_pieces(mesh, trusted[tuple(at.T)], float(frame.voxel_size[1]))
+    return _without_loose_pieces(mesh, measured[tuple(at.T)], float(frame.voxel_size[1]))
 
 
 def combine(
-    field: DistanceField, logits: Float[np.ndarray, "x y z"]
+    field: DistanceField, logits: Float[np.ndarray, "x y z"], voxel: float
 ) -> tuple[Float[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
-    """Signed distances of the whole shape, in fine voxels, and where they were measured."""
-    measured, trusted, free = jax.device_get(_measured(field))
-    fine = len(measured)
-    scale = fine // RESOLUTION
-    voxel = float(np.abs(measured[trusted]).max(initial=1e-3)) / (3 * scale)
-    decoded = _upsample((NATS - logits) / NATS_PER_VOXEL * scale, scale).clip(-3.0, 3.0)
+    """Signed distances of the whole shape, in fine voxels of `voxel` metres, and the measured part.
+    """
+    measured, trusted, free, seen_free = jax.device_get(_measured(field))
+    measured = measured / voxel
+    scale = len(measured) // RESOLUTION
+    occupied = (1 - seen_free) / (1 + np.exp(-logits))
+    composed = np.log(occupied.clip(1e-6) / (1 - occupied).clip(1e-6))
+    decoded = _upsample((NATS - composed) / NATS_PER_VOXEL * scale, scale).clip(-3.0, 3.0)
+    trusted = trusted & (measured > -DEEP)
     if not trusted.any():
         return decoded, trusted
     away, nearest = ndimage.distance_transform_edt(~trusted, return_indices=True)
-    carried_on = (measured / voxel)[tuple(nearest)].clip(-3.0, 3.0)
+    carried_on = measured[tuple(nearest)].clip(-3.0, 3.0)
     share = np.clip(1 - away / (REACH * scale), 0, 1)
     distance = share * carried_on + (1 - share) * decoded
-    distance = np.where(free & ~trusted, np.maximum(distance, 1.0), distance)
-    smooth = ndimage.gaussian_filter(distance, 1.0)
-    distance = np.where(trusted, measured / voxel, smooth)
-    return _filled(distance, free), trusted
+    # Free space is smoothed as one, so that single rays leave no holes and no spikes.
+    passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
+    distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), 6 * passed - 3.0)
+    distance = np.where(trusted, measured, distance)
+    return _filled(distance, free), trusted & (np.abs(measured) < 1.5)
 
 
 @jax.jit
-def _measured(field: DistanceField) -> tuple[Array, Array, Array]:
-    return mean_distance(field), evidence.is_trusted(field), field.free > 0.5
+def _measured(field: DistanceField) -> tuple[Array, Array, Array, Array]:
+    free = evidence.evidence(field).free
+    return mean_distance(field), evidence.is_trusted(field), field.free > 0.5, free
 
 
 def _upsample(coarse: Float[np.ndarray, "x y z"], scale: int) -> Float[np.ndarray, "X Y Z"]:
