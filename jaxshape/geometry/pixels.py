@@ -94,6 +94,9 @@ def surface_pixels(
     return SurfacePixels(measured, jnp.where(surface, slope, 0))
 
 
+GREATEST = 2.0
+"""Slope in the corner of an image of 120 degrees; on the axis it is 1 at most."""
+
 SLOPE_BITS = 8
 """Of the 32 that hold a pixel: 15 of the mantissa are left for depth, 0.06 mm at 2 m."""
 
@@ -102,14 +105,15 @@ def pack(pixels: SurfacePixels) -> UInt32[Array, "*n"]:
     """Depth with the slope in its last bits, so that one look-up finds both."""
     steps = 2**SLOPE_BITS - 1
     bits = lax.bitcast_convert_type(pixels.depth, jnp.uint32)
-    return (bits & ~jnp.uint32(steps)) | jnp.rint(pixels.slope * steps).astype(jnp.uint32)
+    slope = jnp.rint(jnp.minimum(pixels.slope / GREATEST, 1) * steps)
+    return (bits & ~jnp.uint32(steps)) | slope.astype(jnp.uint32)
 
 
 def unpack(packed: UInt32[Array, "*n"]) -> SurfacePixels:
     """The pixels that were packed."""
     steps = jnp.uint32(2**SLOPE_BITS - 1)
     depth = lax.bitcast_convert_type(packed & ~steps, jnp.float32)
-    return SurfacePixels(depth, (packed & steps).astype(jnp.float32) / steps.astype(jnp.float32))
+    return SurfacePixels(depth, (packed & steps).astype(jnp.float32) * (GREATEST / (2**SLOPE_BITS - 1)))
 
 
 def _neighbours(image: Float[Array, "h w"], step: int):

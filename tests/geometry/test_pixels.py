@@ -82,10 +82,10 @@ def test_a_pixel_that_is_not_segmented_makes_no_surface_but_keeps_its_depth():
 
 def test_packing_keeps_depth_to_a_tenth_of_a_millimetre():
     depth = jnp.array([0.0, 0.4321, 1.0, 1.99999, 3.7, jnp.inf])
-    slope = jnp.array([0.0, 0.1, 0.333, 1.0, 0.5, 0.0])
+    slope = jnp.array([0.0, 0.1, 0.333, 1.0, 1.3, 0.0])
     found = unpack(pack(SurfacePixels(depth, slope)))
     np.testing.assert_allclose(found.depth, depth, atol=2e-4)
-    np.testing.assert_allclose(found.slope, slope, atol=2e-3)
+    np.testing.assert_allclose(found.slope, slope, atol=4e-3)
     assert found.depth[0] == 0 and np.isinf(found.depth[-1])
 
 
