@@ -10,6 +10,11 @@ from jaxshape.geometry.evidence import Evidence
 from jaxshape.search.objective import BALANCED, Target, Weights
 
 
+LEAST_ALPHA = 0.8
+"""Weight of the prior, whatever was seen. The paper's alpha falls to .2 after 18 frames, and the
+search then gives the hidden part up to fit the noise of what is measured."""
+
+
 def soft_target(
     evidence: Evidence,
     prior_logits: Float[Array, "*batch x y z"],
@@ -17,7 +22,7 @@ def soft_target(
 ) -> Target:
     """Weights of Eq. 7: measurements by their certainty, the prior by what is unknown.
 
-    With probabilities of 0 and 1 this is `objective.target` of F and M.
+    With probabilities of 0 and 1 this is `objective.target` of F and M, but for the least alpha.
 
     Args:
         evidence: What the frames say about each voxel.
@@ -29,7 +34,8 @@ def soft_target(
     """
     unknown = 1 - evidence.surface - evidence.free
     total = unknown.sum((-3, -2, -1), keepdims=True)
-    alpha = weights.prior * total / jnp.maximum(math.prod(unknown.shape[-3:]) - total, 1)
+    alpha = total / jnp.maximum(math.prod(unknown.shape[-3:]) - total, 1)
+    alpha = weights.prior * jnp.maximum(alpha, LEAST_ALPHA)
     G0 = jax.nn.sigmoid(prior_logits)
     return Target(
         occupied=evidence.surface + alpha * unknown * G0,
