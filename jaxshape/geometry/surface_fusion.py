@@ -21,7 +21,7 @@ from jaxshape.geometry.grid import RESOLUTION, GridFrame
 REACH = 1.5
 """Voxels over which measured distances fade out beyond the edge of what was measured."""
 
-NATS = 1.5
+NATS = 0.25
 """Logits of the decoded surface: above 0, for occupied voxels reach beyond the surface they hold."""
 
 NATS_PER_VOXEL = 6.0
@@ -29,6 +29,12 @@ NATS_PER_VOXEL = 6.0
 
 DEEP = 1.5
 """Fine voxels behind a surface down to which its distances are taken as they are."""
+
+LITTLE = 0.03
+"""Weight at which a measured distance and the smooth surface around it count the same."""
+
+CRUMB = 0.01
+"""Share of the largest piece's area below which a loose piece is dropped wherever it lies."""
 
 FLOOR = 1.0
 """Voxels above the lowest occupied height within which a loose piece stands on the floor."""
@@ -90,6 +96,7 @@ def combine(
     """Signed distances of the whole shape, in fine voxels of `voxel` metres, and the measured part.
     """
     measured, trusted, free, seen_free = jax.device_get(_measured(field))
+    weight = np.asarray(field.weight)
     measured = measured / voxel
     scale = len(measured) // RESOLUTION
     occupied = (1 - seen_free) / (1 + np.exp(-logits))
@@ -105,7 +112,8 @@ def combine(
     # Free space is smoothed as one, so that single rays leave no holes and no spikes.
     passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
     distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), 6 * passed - 3.0)
-    distance = np.where(trusted, measured, distance)
+    certainty = np.where(trusted, weight**2 / (weight**2 + LITTLE**2), 0)
+    distance = certainty * measured + (1 - certainty) * distance
     return _filled(distance, free), trusted & (np.abs(measured) < 1.5)
 
 
@@ -146,7 +154,7 @@ def _without_loose_pieces(
     lowest = np.full(len(area), np.inf)
     np.minimum.at(lowest, labels, mesh.vertices[:, 1])
     main = int(np.argmax(area))
-    keep = lowest < mesh.vertices[:, 1].min() + FLOOR * voxel
+    keep = (lowest < mesh.vertices[:, 1].min() + FLOOR * voxel) & (area > CRUMB * area[main])
     keep[main] = True
     vertex = keep[labels]
     index = np.cumsum(vertex) - 1
