@@ -1,14 +1,13 @@
 """Shape priors small enough for tests: a tiny network, and a linear one that compiles at once."""
 
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import settings
-from known_shape import known_shape
+from known_shape import install, known_shape
 from orbit_recording import Recording, record
 
 from jaxshape import cli
@@ -19,7 +18,7 @@ from jaxshape.mapping.finding import find_start
 from jaxshape.mapping.incremental import build_mapper
 from jaxshape.mapping.recording import follow
 from jaxshape.mapping.segmentation import Prompt
-from jaxshape.model.autoencoder import AUTOENCODER, initialize
+from jaxshape.model.autoencoder import initialize
 from jaxshape.model.config import Architecture
 from jaxshape.model.weights import ShapePrior
 from jaxshape.search import objective, reconstruction, run
@@ -45,28 +44,27 @@ def prior() -> ShapePrior:
         return jnp.full(x.shape, float(name in ("scale", "var")))
 
     params = jax.tree_util.tree_map_with_path(fill, shapes)
-    return ShapePrior(AUTOENCODER, params, jnp.zeros(10), jnp.eye(10))
+    return ShapePrior(params, jnp.zeros(10), jnp.eye(10))
 
 
-@pytest.fixture(scope="session")
-def linear_prior() -> ShapePrior:
-    """A basis of random grids, which compiles at once: for tests of what goes on around it."""
-    params = {
-        "components": jax.random.normal(jax.random.key(5), (10, 32, 32, 32)) / 200,
-        "mean": jnp.full((32, 32, 32), 0.49),
-        "variances": jnp.ones(10),
-        "slope": jnp.float32(100.0),
-        "noise": jnp.float32(1e-3),
-    }
-    return ShapePrior(PCA, params, jnp.zeros(10), jnp.eye(10))
+@pytest.fixture(scope="module")
+def linear_prior():
+    """The network is replaced by a linear one, for tests of what goes on around it."""
 
+    def encode(params, grid):
+        return jnp.einsum("...xyz,dxyz->...d", grid.astype(jnp.float32), params) / 32
 
-@pytest.fixture(scope="session")
-def linear_weights(linear_prior, tmp_path_factory) -> Path:
-    """A file with these weights."""
-    path = tmp_path_factory.mktemp("linear") / "weights.safetensors"
-    save_prior(path, linear_prior, {})
-    return path
+    def decode(params, code):
+        return jnp.einsum("...d,dxyz->...xyz", code, params) - 1
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reconstruction, "encode", encode)
+        patch.setattr(reconstruction, "decode", decode)
+        patch.setattr(objective, "decode", decode)
+        patch.setattr(run, "decode", decode)
+        patch.setattr(run, "prepare_decoder", lambda params: params)
+        params = jax.random.normal(jax.random.key(5), (10, 32, 32, 32))
+        yield ShapePrior(params, jnp.zeros(10), jnp.eye(10))
 
 
 @pytest.fixture(scope="session")
@@ -76,26 +74,30 @@ def walk() -> Recording:
 
 
 @pytest.fixture(scope="session")
-def known(walk) -> ShapePrior:
-    """A prior that knows the chair of the walk."""
+def known_prior(walk) -> ShapePrior:
     return known_shape(walk.chair, walk.box.size)
 
 
-@pytest.fixture(scope="session")
-def known_weights(known, tmp_path_factory) -> Path:
-    """A file with these weights."""
-    path = tmp_path_factory.mktemp("known") / "weights.safetensors"
-    save_prior(path, known, {})
-    return path
+@pytest.fixture(scope="module")
+def known(known_prior):
+    """The network is replaced by one that knows the chair of the walk."""
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch.setattr, known_prior)
+        yield known_prior
 
 
 @pytest.fixture(scope="session")
-def mapper(known):
-    """Compiled once."""
+def session_mapper(known_prior):
+    """Compiled once; to be used where the network is replaced."""
     search = RefineConfig(iterations=2)
     mapping = MappingConfig(keyframe_iterations=2, keyframe_angle=14.0)  # eight keyframes at most
-    refiner = refiner_for("cma", known, search)
-    return build_mapper(known, refiner, search, mapping, TrackingConfig())
+    refiner = refiner_for("cma", known_prior, search)
+    return build_mapper(known_prior, refiner, search, mapping, TrackingConfig())
+
+
+@pytest.fixture(scope="module")
+def mapper(known, session_mapper):
+    return session_mapper
 
 
 @pytest.fixture(scope="module")

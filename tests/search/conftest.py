@@ -2,36 +2,32 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
-from jaxshape.model.shapes import Prepared, ShapeModel, ShapePrior
-from jaxshape.search import rows
-
-SHAPE, D = (3, 3, 3), 4
+from jaxshape.search import objective as objective_module
+from jaxshape.search import run as run_module
 
 
-class Counter:
-    """Counts what a linear map decodes."""
+class CountedDecoder:
+    """A linear map in the network's place; counts what the objective asks for."""
 
     def __init__(self):
         self.traces, self._calls = 0, []
-        self.model = ShapeModel("counted", self._encode, self._decode)
 
-    @staticmethod
-    def _encode(params, grids):
-        return jnp.tensordot(grids.occupied.astype(params.dtype), params, ([1, 2, 3], [1, 2, 3]))
+    def __call__(self, params, code):
+        return jnp.tensordot(code, params, 1)
 
-    def _decode(self, prepared: Prepared, codes):
+    def counting(self, params, code):
         self.traces += 1
-        jax.debug.callback(lambda: self._calls.append(len(codes)))
-        return jnp.tensordot(codes, prepared.shared, 1)
+        rows = code.size // code.shape[-1]
+        jax.debug.callback(lambda: self._calls.append(rows))
+        return self(params, code)
 
     def codes(self) -> int:
         """Codes decoded since the last time this was asked."""
         jax.effects_barrier()
-        count, self._calls = sum(self._calls), []
-        return count
+        rows, self._calls = sum(self._calls), []
+        return rows
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +39,12 @@ def compile_quickly():
 
 
 @pytest.fixture(scope="module")
-def counter(compile_quickly):
-    """Counts codes, which are decoded one at a time."""
+def decoder(compile_quickly):
+    """Stands for the network, one code at a time."""
+    counted = CountedDecoder()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(rows.ROWS_AT_A_TIME, "cpu", 1)
-        yield Counter()
-
-
-@pytest.fixture(scope="module")
-def counted(counter) -> ShapePrior:
-    """A shape prior whose decoder is counted."""
-    params = jnp.asarray(np.random.default_rng(1).normal(size=(D, *SHAPE)), jnp.float32)
-    return ShapePrior(counter.model, params, jnp.zeros(D), jnp.eye(D))
+        patch.setattr(objective_module, "decode", counted.counting)
+        patch.setattr(run_module, "decode", counted)
+        patch.setattr(run_module, "prepare_decoder", lambda params: params)
+        patch.setattr(objective_module, "CANDIDATES_AT_A_TIME", {"cpu": 1, "default": 1})
+        yield counted

@@ -1,0 +1,25 @@
+"""Points against distances on two chairs."""
+
+import json
+from dataclasses import replace
+
+from test_smoke import load
+
+
+def test_measurement(linear_prior, tmp_path, monkeypatch):
+    script = load("measurement")
+    monkeypatch.setattr(script, "load_prior", lambda: linear_prior)
+    from jaxshape.search import reconstruction
+
+    for network in ("encode", "decode"):
+        monkeypatch.setattr(script, network, getattr(reconstruction, network))
+    config = replace(script.Config(), smoke=True, results=tmp_path)
+    script.main(config)
+    content = json.loads((tmp_path / "measurement.json").read_text())
+    F = {way: content["means"][way]["F"] for way in ("points", "distances")}
+    assert len(content["rows"]) == 2 and F["distances"][1] > F["distances"][0]
+    assert content["means"]["distances"]["oracle"][1] > content["means"]["points"]["oracle"][1]
+
+    before = (tmp_path / "measurement.json").read_text()
+    script.main(config)
+    assert (tmp_path / "measurement.json").read_text() == before
