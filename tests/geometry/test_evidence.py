@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxshape.geometry import distance, evidence
 from jaxshape.geometry.distance import DistanceField
@@ -28,10 +29,17 @@ def test_nothing_measured_is_unknown():
 def test_a_wall_is_surface_where_it_stands_free_before_it_and_unknown_behind():
     found = find(wall(66.2))
     F, M = evidence.occupied(found), evidence.occluded(found)
-    np.testing.assert_array_equal(F[16], True)  # fine voxels 64 to 67
+    np.testing.assert_array_equal(F[16, 1:-1, 1:-1], True)  # fine voxels 64 to 67
     np.testing.assert_array_equal(np.asarray(F).any(axis=(1, 2)).sum(), 1)
     assert not M[17:].any() and (found.free[18:] == 1).all()
     assert M[:15].all()
+
+
+@pytest.mark.parametrize("at", [3.6, 124.4])
+def test_a_face_of_the_box_stays_inside_it(at):
+    """Noise has taken it into the outermost voxels, which the box leaves free."""
+    F = np.asarray(evidence.occupied(find(wall(at))))
+    assert not F[[0, -1]].any() and F[1 if at < 64 else -2, 1:-1, 1:-1].all()
 
 
 def test_probabilities_add_up_to_one_at_most():

@@ -91,7 +91,7 @@ def test_pieces_in_the_air_are_dropped_and_counted(table):
     with_crumb = logits.copy()
     with_crumb[2, 8:10, 2] = 6
     clean, found = fuse_surface(field, logits, frame), fuse_surface(field, with_crumb, frame)
-    assert found.dropped == 1 and clean.dropped == 0
+    assert found.dropped == clean.dropped + 1
     assert len(found.mesh.vertices) == len(clean.mesh.vertices)
     assert not found.measured.any()
 

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxshape.geometry.evidence import Evidence
-from jaxshape.geometry.symmetry import NATS, mirror, mirrored, symmetrised
+from jaxshape.geometry.symmetry import AGREEMENT, NATS, mirror, mirrored, symmetrised
 
 find = jax.jit(mirrored)
 
@@ -31,7 +31,7 @@ def test_unknown_voxels_learn_from_their_seen_mirror_images():
 
 def test_an_object_whose_sides_disagree_is_left_as_it_is():
     found = find(half_seen(asymmetric=True))
-    assert not bool(found.symmetric) and float(found.agreement) < 0.5
+    assert not bool(found.symmetric) and float(found.agreement) < AGREEMENT
     np.testing.assert_array_equal(found.logits, 0)
     logits = jax.random.normal(jax.random.key(0), (32, 32, 32))
     np.testing.assert_array_equal(symmetrised(logits, found), logits)
