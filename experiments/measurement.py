@@ -16,7 +16,7 @@ import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,20 @@ import numpy as np
 import tyro
 
 from jaxshape.data.archives import list_meshes
-from jaxshape.data.capture import Capture, camera_distance, capture, fuse_frames, measure_frames
+from jaxshape.data.capture import (
+    Capture,
+    camera_distance,
+    capture,
+    fuse_frames,
+    measure_frames,
+    sensor_of,
+)
 from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
 from jaxshape.data.meshes import Model
 from jaxshape.data.virtual_cameras import CAMERAS, CameraName
 from jaxshape.geometry import camera, evidence, fusion
 from jaxshape.geometry.evidence import Evidence
+from jaxshape.geometry.pixels import Sensor
 from jaxshape.geometry.symmetry import mirrored, symmetrised
 from jaxshape.model.autoencoder import decode, encode
 from jaxshape.model.weights import ShapePrior, fingerprint, load_prior
@@ -135,7 +143,7 @@ def observe(chair: Object, config: Config) -> Seen:
     seed = hash_seed(0, *model.name.encode())
     captured = capture(model.mesh, T, noise=config.noise, seed=seed, camera=device)
     points = jax.device_get(_points(captured, config.frames))
-    found = jax.device_get(_evidence(captured, config.frames))
+    found = jax.device_get(_evidence(captured, config.frames, sensor_of(device)))
     return Seen(points, found, np.stack([np.asarray(captured.surface)] * len(config.frames)))
 
 
@@ -146,9 +154,9 @@ def _points(captured: Capture, frames: tuple[int, ...]) -> tuple[jax.Array, jax.
     return fusion.occupied(chosen), fusion.occluded(chosen)
 
 
-@partial(jax.jit, static_argnames="frames")
-def _evidence(captured: Capture, frames: tuple[int, ...]) -> Evidence:
-    fused = fuse_frames(captured, frames)
+@partial(jax.jit, static_argnames=("frames", "sensor"))
+def _evidence(captured: Capture, frames: tuple[int, ...], sensor: Sensor) -> Evidence:
+    fused = fuse_frames(captured, frames, sensor)
     return jax.lax.map(evidence.evidence, fused)
 
 
@@ -160,9 +168,7 @@ def rebuilder(prior: ShapePrior, iterations: int):
     def search(prior: ShapePrior, code: jax.Array, targets: Target) -> jax.Array:
         keys = jax.random.split(jax.random.key(0), len(code))  # Adam draws none
         space = search_space(prior, config)
-        return refine(
-            keys, prior.params, code, targets, refiner, iterations, space=space
-        ).logits
+        return refine(keys, prior.params, code, targets, refiner, iterations, space=space).logits
 
     @jax.jit
     def rebuild(prior: ShapePrior, seen: Seen) -> dict[str, dict[str, jax.Array]]:

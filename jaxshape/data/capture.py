@@ -1,5 +1,6 @@
 """One object seen by the virtual camera: depth frames, measurements, ground truth. [host]"""
 
+import math
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.geometry.pixels import Sensor
 
 SURFACE_SAMPLES = 50_000
 """Points sampled on a CAD model to find its surface voxels: some 15 for each of them."""
@@ -93,7 +95,15 @@ def measure_frames(captured: Capture) -> Measurement:
     return jax.vmap(one)(depth, captured.T_object_camera)
 
 
-def fuse_frames(captured: Capture, frames: tuple[int, ...]) -> DistanceField:
+def sensor_of(camera: VirtualCamera) -> Sensor:
+    """How well a camera measures depth: its noise, and the steps in which depths come."""
+    step = camera.noise.quantization / math.sqrt(12)  # the deviation of a uniform distribution
+    return Sensor(axial=math.hypot(camera.noise.axial, step))
+
+
+def fuse_frames(
+    captured: Capture, frames: tuple[int, ...], sensor: Sensor = Sensor()
+) -> DistanceField:
     """Signed distances fused from the first k frames, for each k of an increasing tuple.
 
     Frames are added one at a time, so that one field at a time is in memory, besides those asked
@@ -102,14 +112,14 @@ def fuse_frames(captured: Capture, frames: tuple[int, ...]) -> DistanceField:
 
     def add(field: DistanceField, frame: tuple[Array, jaxlie.SE3]) -> tuple[DistanceField, None]:
         depth, T = frame
-        one = distance.measure(
-            depth, jnp.isfinite(depth), captured.intrinsics, T, captured.frame
-        )
+        seen = jnp.isfinite(depth)
+        one = distance.measure(depth, seen, captured.intrinsics, T, captured.frame, sensor)
         return distance.merge(field, one), None
 
-    depth, field, found = jnp.asarray(captured.depth), distance.nothing_measured(), []
-    for first, last in pairwise((0, *frames)):
-        some = jax.tree.map(lambda x: x[first:last], (depth, captured.T_object_camera))
+    all_frames = jnp.asarray(captured.depth), captured.T_object_camera
+    field, found = distance.nothing_measured(), []
+    for chosen in (slice(*ends) for ends in pairwise((0, *frames))):
+        some = jax.tree.map(lambda x, chosen=chosen: x[chosen], all_frames)
         field, _ = jax.lax.scan(add, field, some)
         found.append(field)
     return jax.tree.map(lambda *x: jnp.stack(x), *found)

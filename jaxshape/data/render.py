@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxshape.data.virtual_cameras import CAMERAS, SensorNoise, VirtualCamera
 from jaxshape.geometry.camera import Intrinsics
@@ -94,10 +94,8 @@ def render_depth(
     cosine = np.ones_like(depth)
     for i, pose in enumerate(poses):  # one by one, views stay in the processor's cache
         pixel, origin = np.flatnonzero(may_hit[i]), pose[:3, 3]
-        directions = (rays @ pose[:3, :3].T)[pixel]
-        triangle = mesh.ray.intersects_first(
-            np.broadcast_to(origin, directions.shape), directions
-        )
+        directions = rays[pixel] @ pose[:3, :3].T
+        triangle = mesh.ray.intersects_first(np.broadcast_to(origin, directions.shape), directions)
         hit = np.flatnonzero(triangle >= 0)
         pixel, triangle, directions = pixel[hit], triangle[hit], directions[hit]
         facing = _dot(normals[triangle], directions)
@@ -136,36 +134,57 @@ def _may_hit(
     intrinsics: Intrinsics,
     size: tuple[int, int],
 ) -> Bool[np.ndarray, "views h w"]:
-    """Pixels in tiles that some triangle may touch: all that can hit, and few others.
-
-    Each triangle marks the rectangle of tiles around its corners. A rectangle is four entries of a
-    difference image, and two cumulative sums count the rectangles over each tile.
-    """
+    """Pixels in tiles that some triangle may touch: all that can hit, and few others."""
     rows, columns = -(-size[0] // TILE), -(-size[1] // TILE)
     points = (mesh.vertices - poses[:, None, :3, 3]) @ poses[:, :3, :3]
     depth = points[..., 2]
-    behind = (depth <= 0).any(axis=1)  # a mesh that reaches behind the camera may be anywhere
+    behind = np.asarray((depth <= 0).any(axis=1))  # such a mesh may be anywhere
     fx, fy, cx, cy = (float(x) for x in intrinsics)
-    scaled = points[..., :2] * (fx, fy) / np.where(depth > 0, depth, 1)[..., None] + (cx, cy)
-    # A hundredth of a pixel makes up for rounding.
-    tile = lambda x, shift: np.floor((x + shift) / TILE).astype(np.int32)  # noqa: E731
-    low, high = tile(scaled, -0.01), tile(scaled, 0.01) + 1
-    view = np.arange(len(poses))[:, None] * (rows + 1) * (columns + 1)
-    ends = []
-    for axis, count in ((0, columns), (1, rows)):
-        a, b, c = low[:, mesh.faces, axis].transpose(2, 0, 1)
-        d, e, f = high[:, mesh.faces, axis].transpose(2, 0, 1)
-        first, last = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(d, e), f)
-        ends.append((first.clip(0, count), last.clip(0, count)))
-    (left, right), (top, bottom) = ends
-    changes = np.zeros(len(poses) * (rows + 1) * (columns + 1), np.int64)
-    for row, column, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1),
-                              (bottom, right, 1)):  # fmt: skip
-        index = (view + row * (columns + 1) + column).ravel()
-        changes += sign * np.bincount(index, minlength=len(changes))
-    counts = changes.reshape(-1, rows + 1, columns + 1).cumsum(axis=1).cumsum(axis=2)
-    marked = (counts[:, :-1, :-1] > 0) | behind[:, None, None]
+    pixels = points[..., :2] * (fx, fy) / np.where(depth > 0, depth, 1)[..., None] + (cx, cy)
+    left, right = _ends(pixels[..., 0], mesh.faces, columns)
+    top, bottom = _ends(pixels[..., 1], mesh.faces, rows)
+    marked = _cover(left, right, top, bottom, (rows, columns)) | behind[:, None, None]
     return marked.repeat(TILE, axis=1).repeat(TILE, axis=2)[:, : size[0], : size[1]]
+
+
+def _ends(
+    pixels: Float[np.ndarray, "views vertices"], faces: Int[np.ndarray, "faces 3"], count: int
+) -> tuple[Int[np.ndarray, "views faces"], Int[np.ndarray, "views faces"]]:
+    """First tile that each triangle may touch along one axis, and the one after its last."""
+    # A hundredth of a pixel makes up for rounding.
+    low = np.floor((pixels - 0.01) / TILE).astype(np.int32)
+    high = np.floor((pixels + 0.01) / TILE).astype(np.int32) + 1
+    a, b, c = (low[:, faces[:, i]] for i in range(3))
+    d, e, f = (high[:, faces[:, i]] for i in range(3))
+    first, last = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(d, e), f)
+    return first.clip(0, count), last.clip(0, count)
+
+
+def _cover(
+    left: Int[np.ndarray, "views n"],
+    right: Int[np.ndarray, "views n"],
+    top: Int[np.ndarray, "views n"],
+    bottom: Int[np.ndarray, "views n"],
+    shape: tuple[int, int],
+) -> Bool[np.ndarray, "views rows columns"]:
+    """Tiles inside any of the rectangles of their view.
+
+    A rectangle changes four entries of a difference image, whose sums along both axes count the
+    rectangles over each tile.
+    """
+    rows, columns = shape[0] + 1, shape[1] + 1
+    view = np.arange(len(left))[:, None] * rows * columns
+    changes = np.zeros(len(left) * rows * columns, np.int64)
+    for row, column, sign in (
+        (top, left, 1),
+        (top, right, -1),
+        (bottom, left, -1),
+        (bottom, right, 1),
+    ):
+        index = (view + row * columns + column).ravel()
+        changes += sign * np.bincount(index, minlength=len(changes))
+    counts = changes.reshape(-1, rows, columns).cumsum(axis=1).cumsum(axis=2)
+    return counts[:, :-1, :-1] > 0
 
 
 def add_sensor_noise(

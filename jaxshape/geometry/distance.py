@@ -16,7 +16,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
-from jax import lax
 
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.grid import RESOLUTION, GridFrame

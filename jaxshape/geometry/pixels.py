@@ -113,7 +113,9 @@ def unpack(packed: UInt32[Array, "*n"]) -> SurfacePixels:
     """The pixels that were packed."""
     steps = jnp.uint32(2**SLOPE_BITS - 1)
     depth = lax.bitcast_convert_type(packed & ~steps, jnp.float32)
-    return SurfacePixels(depth, (packed & steps).astype(jnp.float32) * (GREATEST / (2**SLOPE_BITS - 1)))
+    return SurfacePixels(
+        depth, (packed & steps).astype(jnp.float32) * (GREATEST / (2**SLOPE_BITS - 1))
+    )
 
 
 def _neighbours(image: Float[Array, "h w"], step: int):

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Bool, Float
 from scipy import ndimage
-from skimage.measure import marching_cubes
+from skimage.measure import label, marching_cubes
 
 from jaxshape.geometry import evidence
 from jaxshape.geometry.distance import DistanceField, mean_distance
@@ -22,13 +22,16 @@ REACH = 1.5
 """Voxels over which measured distances fade out beyond the edge of what was measured."""
 
 NATS = 0.25
-"""Logits of the decoded surface: above 0, for occupied voxels reach beyond the surface they hold."""
+"""Logits at the decoded surface: above 0, for occupied voxels reach beyond what they hold."""
 
 NATS_PER_VOXEL = 6.0
 """How steeply logits rise across a decoded surface."""
 
 DEEP = 1.5
 """Fine voxels behind a surface down to which its distances are taken as they are."""
+
+FAR, NEAR = 3.0, 1.5
+"""Fine voxels at which distances end, and within which a measured surface is nearby."""
 
 LITTLE = 0.03
 """Weight at which a measured distance and the smooth surface around it count the same."""
@@ -93,34 +96,59 @@ def fuse_surface(
 def combine(
     field: DistanceField, logits: Float[np.ndarray, "x y z"], voxel: float
 ) -> tuple[Float[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
-    """Signed distances of the whole shape, in fine voxels of `voxel` metres, and the measured part.
+    """Signed distances of the whole shape, and where a surface was measured.
+
+    Args:
+        field: Of one object.
+        logits: Its decoded shape.
+        voxel: Metres that count as 1 in the distances: the side of a fine voxel.
+
+    Returns:
+        Distances at the centres of fine voxels, and True next to the measured surface.
     """
     measured, trusted, free, seen_free = jax.device_get(_measured(field))
-    weight = np.asarray(field.weight)
     measured = measured / voxel
-    scale = len(measured) // RESOLUTION
-    occupied = (1 - seen_free) / (1 + np.exp(-logits))
-    composed = np.log(occupied.clip(1e-6) / (1 - occupied).clip(1e-6))
-    decoded = _upsample((NATS - composed) / NATS_PER_VOXEL * scale, scale).clip(-3.0, 3.0)
     trusted = trusted & (measured > -DEEP)
+    decoded = _decoded(logits, seen_free, len(measured) // RESOLUTION)
     if not trusted.any():
         return decoded, trusted
-    away, nearest = ndimage.distance_transform_edt(~trusted, return_indices=True)
-    carried_on = measured[tuple(nearest)].clip(-3.0, 3.0)
-    share = np.clip(1 - away / (REACH * scale), 0, 1)
-    distance = share * carried_on + (1 - share) * decoded
-    # Free space is smoothed as one, so that single rays leave no holes and no spikes.
+    distance = _carried_on(measured, trusted, decoded)
+    # Free space is smoothed as a whole, so that single rays leave neither holes nor spikes.
     passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
-    distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), 6 * passed - 3.0)
-    certainty = np.where(trusted, weight**2 / (weight**2 + LITTLE**2), 0)
+    distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), FAR * (2 * passed - 1))
+    weight = np.where(trusted, np.asarray(field.weight), 0)
+    certainty = weight**2 / (weight**2 + LITTLE**2)
     distance = certainty * measured + (1 - certainty) * distance
-    return _filled(distance, free), trusted & (np.abs(measured) < 1.5)
+    return _filled(distance, free), trusted & (np.abs(measured) < NEAR)
 
 
 @jax.jit
 def _measured(field: DistanceField) -> tuple[Array, Array, Array, Array]:
     free = evidence.evidence(field).free
     return mean_distance(field), evidence.is_trusted(field), field.free > 0.5, free
+
+
+def _decoded(
+    logits: Float[np.ndarray, "x y z"], free: Float[np.ndarray, "x y z"], scale: int
+) -> Float[np.ndarray, "X Y Z"]:
+    """Logits as distances, in fine voxels; voxels that were seen to be free are not filled."""
+    occupied = ((1 - free) / (1 + np.exp(-logits))).clip(1e-6, 1 - 1e-6)
+    logits = np.log(occupied / (1 - occupied))
+    return _upsample((NATS - logits) / NATS_PER_VOXEL * scale, scale).clip(-FAR, FAR)
+
+
+def _carried_on(
+    measured: Float[np.ndarray, "X Y Z"],
+    trusted: Bool[np.ndarray, "X Y Z"],
+    decoded: Float[np.ndarray, "X Y Z"],
+) -> Float[np.ndarray, "X Y Z"]:
+    """Measured distances that fade into decoded ones beyond the edge of what was measured."""
+    nearest = np.asarray(
+        ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
+    )
+    away = np.sqrt(((nearest - np.indices(trusted.shape, np.int32)) ** 2).sum(axis=0))
+    share = np.clip(1 - away / (REACH * len(trusted) / RESOLUTION), 0, 1)
+    return share * measured[tuple(nearest)].clip(-FAR, FAR) + (1 - share) * decoded
 
 
 def _upsample(coarse: Float[np.ndarray, "x y z"], scale: int) -> Float[np.ndarray, "X Y Z"]:
@@ -138,8 +166,9 @@ def _filled(
 ) -> Float[np.ndarray, "X Y Z"]:
     """The shape without cavities: shells hide the inside of solids, which no frame sees."""
     outside = np.pad(distance > 0, 1, constant_values=True)
-    labels, count = ndimage.label(outside)
-    seen = np.bincount(labels[1:-1, 1:-1, 1:-1][free & (distance > 0)], minlength=count + 1) > 0
+    labels = np.asarray(label(outside, connectivity=1))
+    seen = np.zeros(labels.max() + 1, bool)
+    seen[labels[1:-1, 1:-1, 1:-1][free & (distance > 0)]] = True
     seen[labels[0, 0, 0]] = True
     cavity = (labels > 0) & ~seen[labels]
     return np.where(cavity[1:-1, 1:-1, 1:-1], -1.0, distance)

@@ -20,7 +20,7 @@ class Mirrored(NamedTuple):
     Attributes:
         logits: Nats to add to those of a decoded shape, 0 where a voxel was seen itself.
         symmetric: Whether both sides agree where both were measured; logits are 0 where not.
-        agreement: The share of the surface measured on both sides that agrees; 1 where there is none.
+        agreement: The share of the surface measured on both sides that agrees; 1 without any.
     """
 
     logits: Float[Array, "*batch x y z"]
@@ -56,9 +56,7 @@ def mirrored(evidence: Evidence, nats: float = NATS) -> Mirrored:
     symmetric = agreement > AGREEMENT
     unknown = 1 - surface - free
     logits = nats * unknown * (mirror(surface) - other_free)
-    return Mirrored(
-        jnp.where(symmetric[..., None, None, None], logits, 0.0), symmetric, agreement
-    )
+    return Mirrored(jnp.where(symmetric[..., None, None, None], logits, 0.0), symmetric, agreement)
 
 
 def symmetrised(

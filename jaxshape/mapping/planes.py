@@ -63,7 +63,7 @@ def tolerance(z: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarray, "
     """How far, in metres, a point measured at depth `z` may lie from the plane that holds it.
 
     Three standard deviations of a Kinect's noise and half a step of its depth, which grow with the
-    square of depth (see `jaxshape.data.render.SensorNoise`), and 5 mm for a floor that is not flat.
+    square of depth (see `jaxshape.data.virtual_cameras`), and 5 mm for a floor that is not flat.
     """
     return 0.005 + 0.005 * z**2
 

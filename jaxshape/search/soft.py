@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 from jaxshape.geometry.evidence import Evidence
 from jaxshape.search.objective import BALANCED, Target, Weights
 
-
 LEAST_ALPHA = 0.8
 """Weight of the prior, whatever was seen. The paper's alpha falls to .2 after 18 frames, and the
 search then gives the hidden part up to fit the noise of what is measured."""

@@ -6,7 +6,7 @@ import trimesh
 from scipy.ndimage import binary_dilation
 
 from jaxshape.data.capture import camera_distance, capture, discretize, measure_frames
-from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
+from jaxshape.data.virtual_cameras import VirtualCamera
 from jaxshape.geometry import camera, fusion, grid
 
 AZIMUTHS = jnp.repeat(jnp.arange(0.0, 360.0, 60.0), 2)

@@ -79,8 +79,9 @@ def test_every_part_of_a_sphere_is_found_and_no_other(ball):
 
 def test_the_order_of_frames_does_not_matter(ball):
     field, _ = ball
-    forward, backward = distance.merge_all(field), distance.merge_all(
-        jax.tree.map(lambda x: x[::-1], field)
+    forward, backward = (
+        distance.merge_all(field),
+        distance.merge_all(jax.tree.map(lambda x: x[::-1], field)),
     )
     for a, b in zip(forward, backward, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)

@@ -12,11 +12,12 @@ from jaxshape.geometry.pixels import Sensor
 from jaxshape.geometry.surface_fusion import fuse_surface
 
 SIZE = 200
+CLEAN = Sensor(axial=3e-4)
 NOTHING = np.full((32, 32, 32), -9.0, np.float32)
 
 
 @partial(jax.jit, static_argnames="sensor")
-def fused(depth, intrinsics, T, frame, sensor=Sensor(axial=3e-4)):
+def fused(depth, intrinsics, T, frame, sensor=CLEAN):
     one = lambda depth, T: distance.measure(  # noqa: E731
         depth, jnp.isfinite(depth), intrinsics, T, frame, sensor
     )
