@@ -12,7 +12,7 @@ import jaxshape as js
 from benchmarks.harness import Metric, alternate, compiled, optional, speedup
 from benchmarks.problems import FIRST_CHAIR
 from benchmarks.rivals import numpy_fusion
-from jaxshape.geometry import grid
+from jaxshape.geometry import distance, grid
 
 WIDTH, HEIGHT = 640, 480
 DISTANCE = 1.5
@@ -42,12 +42,24 @@ def run(quick: bool) -> list[Metric]:
     if open3d := optional("open3d_fusion"):
         functions["open3d"] = open3d_measure(open3d, frame)
     seconds = alternate(functions, budget=budget, at_least=5)
+    distances, compile_distances = compiled(distance.measure, *frame)
+    tsdf = {"jaxshape": partial(distances, *frame)}
+    if open3d:
+        tsdf["open3d"] = open3d_integrate(open3d, frame)
+    tsdf_seconds = alternate(tsdf, budget=budget, at_least=5)
 
     pixels = int(frame.segmented.sum())
     metrics = [Metric("fusion/compile", compile_seconds, "s")]
     for name, times in seconds.items():
         note = f"{pixels} of {WIDTH * HEIGHT} pixels show the chair" if name == "jaxshape" else ""
         metrics.append(Metric(f"fusion/{name}", 1e3 * np.median(times), "ms", note=note))
+    metrics.append(Metric("fusion/distances/compile", compile_distances, "s"))
+    for name, times in tsdf_seconds.items():
+        note = (
+            f"{distance.FINE * grid.RESOLUTION}^3 voxels, all of them" if name == "jaxshape" else ""
+        )
+        median = 1e3 * np.median(times)
+        metrics.append(Metric(f"fusion/distances/{name}", median, "ms", "lower", note=note))
     for name in [rival for rival in functions if rival != "jaxshape"]:
         metrics.append(
             Metric(
@@ -66,7 +78,7 @@ def chair_frame() -> Frame:
     """A chair before a wall, as a Kinect sees it; a twentieth of the pixels know nothing."""
     mesh = js.random_chair(FIRST_CHAIR)
     T = js.orbit(1, DISTANCE)
-    seen = js.capture(mesh, T, noise=False, seed=0, image_size=WIDTH)
+    seen = js.capture(mesh, T, noise=False, seed=0, camera=js.VirtualCamera(WIDTH, WIDTH, None))
     edge = (WIDTH - HEIGHT) // 2
     depth = np.array(seen.depth[0, edge:-edge])
     segmented = np.isfinite(depth)
@@ -96,6 +108,14 @@ def open3d_measure(open3d, frame: Frame) -> partial:
     camera = open3d.camera_of(tuple(map(float, frame.intrinsics)), pose, depth.shape)
     origin, size = np.array(frame.grid.origin), float(frame.grid.voxel_size[0])
     return partial(open3d.measure, depth, segmented, camera, origin, size)
+
+
+def open3d_integrate(open3d, frame: Frame) -> partial:
+    """Open3D's integration into voxels of the same size, near the surface alone."""
+    depth = np.where(np.array(frame.segmented), np.array(frame.depth), 0)
+    pose = np.array(frame.T_object_camera.as_matrix())
+    size = float(distance.fine_frame(frame.grid).voxel_size[0])
+    return open3d.integration(depth, tuple(map(float, frame.intrinsics)), pose, size)
 
 
 def _agreement(name: str, ours: js.Measurement, theirs: tuple) -> list[Metric]:

@@ -35,7 +35,7 @@ from rich.progress import track
 from figures import PAGE, save_column
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
 from jaxshape.model.weights import fingerprint, load_prior

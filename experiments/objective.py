@@ -26,7 +26,7 @@ import tyro
 from jaxtyping import Array, Bool, Float
 
 from figures import PAGE, interval, save_column
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.weights import fingerprint, load_prior

@@ -36,6 +36,7 @@ from scipy.spatial.transform import Rotation
 from jaxshape.data import meshes
 from jaxshape.data.boxes import Box
 from jaxshape.data.capture import Capture, capture
+from jaxshape.data.virtual_cameras import VirtualCamera
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import camera
 from jaxshape.geometry.overlap import iou
@@ -133,7 +134,8 @@ def _run_seat(source: meshes.MeshSource, config: Config) -> dict[str, Any]:
     assert isinstance(model, meshes.Model), model
     mesh = model.mesh
     T = camera.orbit(config.frames, config.distance * float(mesh.scale), step=config.step)
-    seen = capture(mesh, T, noise=True, seed=0, image_size=config.image_size)
+    camera_model = VirtualCamera(config.image_size, config.image_size, None)
+    seen = capture(mesh, T, noise=True, seed=0, camera=camera_model)
     shots = [_prepare(depth, seen.intrinsics) for depth in np.asarray(seen.depth)]
     box = Box(np.eye(4), np.asarray(mesh.extents, np.float64))
     outcome = {

@@ -47,7 +47,7 @@ from jaxshape.data.dataset import (
 from jaxshape.data.inputs import draw_pair
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.files import atomic_path, write_json
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.config import Architecture, TrainConfig
 from jaxshape.model.shapes import ShapePrior, decode, encode

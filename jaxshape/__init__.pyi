@@ -10,10 +10,11 @@ from .data.sequences import (
     read_trajectory,
     write_trajectory,
 )
+from .data.virtual_cameras import CAMERAS, SensorNoise, VirtualCamera
 from .geometry.camera import Intrinsics, orbit, random_views
-from .geometry.evidence import Grids, binary
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
+from .geometry.grids import Grids, binary
 from .geometry.overlap import iou
 from .mapping.config import MappingConfig, TrackingConfig
 from .mapping.map.mapper import Mapper, build_mapper
@@ -72,6 +73,7 @@ from .search.space import LatentSpace, raw, whitened
 from .search.stopping import Tolerances
 
 __all__ = [
+    "CAMERAS",
     "Architecture",
     "BALANCED",
     "Bounds",
@@ -105,6 +107,7 @@ __all__ = [
     "SOFT",
     "Segmentation",
     "ShapeModel",
+    "SensorNoise",
     "ShapePrior",
     "ShapeScores",
     "Skipped",
@@ -115,6 +118,7 @@ __all__ = [
     "Trace",
     "TrackingConfig",
     "Trajectory",
+    "VirtualCamera",
     "Weights",
     "binary",
     "bounds",

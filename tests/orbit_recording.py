@@ -12,7 +12,8 @@ from PIL import Image
 
 from jaxshape.data.boxes import Box
 from jaxshape.data.chairs import random_chair
-from jaxshape.data.render import SensorNoise, add_sensor_noise, render_depth
+from jaxshape.data.render import add_sensor_noise, render_depth
+from jaxshape.data.virtual_cameras import SensorNoise
 from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
+import open3d.core as o3c
 from jaxtyping import Bool, Float
 
 
@@ -51,6 +52,36 @@ def measure(
     kept = o3d.geometry.VoxelGrid.create_dense(corner, np.zeros(3), voxel_size, side, side, side)
     kept.carve_depth_map(depth_map, camera, keep_voxels_outside_image=True)
     return _grid(surface, resolution), ~_grid(kept, resolution)
+
+
+def integration(
+    depth: Float[np.ndarray, "h w"],
+    intrinsics: tuple[float, float, float, float],
+    T_object_camera: Float[np.ndarray, "4 4"],
+    voxel_size: float,
+    *,
+    truncation: float = 4.0,
+) -> Any:
+    """A function of nothing that integrates a frame into a block grid of signed distances.
+
+    `truncation` is in voxels.
+    """
+    fx, fy, cx, cy = intrinsics
+    lens = o3c.Tensor(np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1.0]]))
+    pose = o3c.Tensor(np.linalg.inv(np.asarray(T_object_camera, np.float64)))
+    image = o3d.t.geometry.Image(o3c.Tensor(np.where(np.isfinite(depth), depth, 0)))
+    volume = o3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight"),
+        attr_dtypes=(o3c.float32, o3c.float32),
+        attr_channels=(1, 1),
+        voxel_size=voxel_size,
+    )
+
+    def integrate() -> None:
+        blocks = volume.compute_unique_block_coordinates(image, lens, pose, 1.0, 1e3, truncation)
+        volume.integrate(blocks, image, lens, pose, 1.0, 1e3, truncation)
+
+    return integrate
 
 
 def _grid(voxels: Any, resolution: int) -> Bool[np.ndarray, "x y z"]:

@@ -1,6 +1,8 @@
 """One object seen by the virtual camera: depth frames, measurements, ground truth. [host]"""
 
+import math
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -11,13 +13,21 @@ import trimesh
 from jaxtyping import Array, Bool, Float
 
 from jaxshape.data import meshes, render
-from jaxshape.geometry import fusion, grid
+from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
+from jaxshape.geometry import distance, fusion, grid
 from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.geometry.pixels import Sensor
 
 SURFACE_SAMPLES = 50_000
 """Points sampled on a CAD model to find its surface voxels: some 15 for each of them."""
+
+PAPER = CAMERAS["paper"]
+
+GRID_MARGIN = grid.RESOLUTION / (grid.RESOLUTION - 2 * grid.MARGIN) - 1
+"""By how much the object's grid is larger than the object, as a share of its size."""
 
 
 class Capture(NamedTuple):
@@ -46,7 +56,7 @@ def capture(
     *,
     noise: bool,
     seed: int,
-    image_size: int = render.IMAGE_SIZE,
+    camera: VirtualCamera = PAPER,
     resolution: int = grid.RESOLUTION,
 ) -> Capture:
     """Look at a mesh from some poses, and find its surface voxels (paper, section 2.3). [host]
@@ -57,24 +67,29 @@ def capture(
     Args:
         mesh: A mesh in the canonical object frame: +y up, front along +z, box centred at the
             origin, in metres.
-        T_object_camera: Poses of the camera `[views]`.
-        noise: Whether to add the faults of a structured-light sensor.
+        T_object_camera: Poses of the camera `[views]`; `camera_distance` says how far away it
+            stands.
+        noise: Whether the images have the faults of the camera's sensor.
         seed: Seed of the noise and of the surface samples, 0 or more.
-        image_size: Pixels along each side of the square images.
+        camera: The depth camera. The window of its images that can show the object's grid is kept.
         resolution: Voxels along each axis of the object's grids.
+
+    Returns:
+        The depth images, the voxel frame and the true surface voxels.
     """
-    intrinsics = render.fit_intrinsics(mesh, T_object_camera, image_size)
-    depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, image_size)
+    intrinsics, size = render.window(camera, mesh, T_object_camera, GRID_MARGIN)
+    depth, cosine = render.render_depth(mesh, T_object_camera, intrinsics, size)
     if noise:
-        depth = render.add_sensor_noise(depth, cosine, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        depth = render.add_sensor_noise(depth, cosine, rng, camera.noise)
     frame = grid.fit_box(*jnp.float32(mesh.bounds), resolution=resolution)
     points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
     return Capture(depth, intrinsics, T_object_camera, frame, discretize(points, frame, resolution))
 
 
-def camera_distance(mesh: trimesh.Trimesh) -> float:
-    """Distance of the virtual camera from the object's centre, in metres."""
-    return render.DISTANCE * float(mesh.scale)
+def camera_distance(mesh: trimesh.Trimesh, camera: VirtualCamera = PAPER) -> float:
+    """Distance of a virtual camera from the object's centre, in metres."""
+    return camera.distance * float(mesh.scale)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -106,3 +121,33 @@ def measure_frames(captured: Capture) -> Measurement:
     )
     one = lambda depth, T: measure(depth, jnp.isfinite(depth), T_object_camera=T)  # noqa: E731
     return jax.vmap(one)(depth, captured.T_object_camera)
+
+
+def sensor_of(camera: VirtualCamera) -> Sensor:
+    """How well a camera measures depth: its noise, and the steps in which depths come."""
+    step = camera.noise.quantization / math.sqrt(12)  # the deviation of a uniform distribution
+    return Sensor(axial=math.hypot(camera.noise.axial, step))
+
+
+def fuse_frames(
+    captured: Capture, frames: tuple[int, ...], sensor: Sensor = Sensor()
+) -> DistanceField:
+    """Signed distances fused from the first k frames, for each k of an increasing tuple.
+
+    Frames are added one at a time, so that one field at a time is in memory, besides those asked
+    for; every pixel that hit something shows the object.
+    """
+
+    def add(field: DistanceField, frame: tuple[Array, jaxlie.SE3]) -> tuple[DistanceField, None]:
+        depth, T = frame
+        seen = jnp.isfinite(depth)
+        one = distance.measure(depth, seen, captured.intrinsics, T, captured.frame, sensor)
+        return distance.merge(field, one), None
+
+    all_frames = jnp.asarray(captured.depth), captured.T_object_camera
+    field, found = distance.nothing_measured(), []
+    for chosen in (slice(*ends) for ends in pairwise((0, *frames))):
+        some = jax.tree.map(lambda x, chosen=chosen: x[chosen], all_frames)
+        field, _ = jax.lax.scan(add, field, some)
+        found.append(field)
+    return jax.tree.map(lambda *x: jnp.stack(x), *found)

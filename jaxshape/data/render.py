@@ -4,49 +4,23 @@ Each pixel casts one ray through its centre; the first triangle it meets hides a
 depth is that of the ray's intersection with the plane of that triangle.
 """
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from jaxshape import checks
-from jaxshape.geometry import camera, sensor
+from jaxshape.data.virtual_cameras import CAMERAS, SensorNoise, VirtualCamera
 from jaxshape.geometry.camera import Intrinsics
 
-IMAGE_SIZE = 96
-"""Pixels along each side of the virtual camera's square images."""
+IMAGE_SIZE = CAMERAS["paper"].width
+"""Pixels along each side of the paper's square images."""
 
-DISTANCE = 1.5
-"""How far the camera stands from the object's centre, in diagonals of its bounding box."""
+TILE = 4
+"""Pixels along each side of the squares in which rays are cast together or not at all."""
 
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """The faults of a structured-light sensor such as the first Kinect.
-
-    Standard deviations and steps grow with the square of depth, see `jaxshape.geometry.sensor`.
-    """
-
-    axial: float = sensor.AXIAL
-    """Standard deviation along the ray, in metres at 1 m; grows with the square of depth."""
-    lateral: float = 0.3
-    """Standard deviation across the image, in pixels (0.8 of the Kinect's, which are smaller)."""
-    quantization: float = sensor.STEP
-    """Step of the measured depth, in metres at 1 m; grows with the square of depth."""
-    dropout: float = 0.3
-    """Probability that a pixel at a depth edge is lost."""
-    grazing: float = 80.0
-    """Surfaces seen at more than this angle, in degrees, from their normal are lost."""
-
-    def __post_init__(self) -> None:
-        checks.at_least("axial", self.axial, 0)
-        checks.at_least("lateral", self.lateral, 0)
-        checks.positive("quantization", self.quantization, "metres")
-        checks.within("dropout", self.dropout, 0, 1)
-        checks.within("grazing", self.grazing, 0, 180)
+WINDOW_STEP = 8
+"""Pixels in steps of which a window grows, so that few compiled programs serve for all."""
 
 
 def fit_intrinsics(
@@ -60,38 +34,90 @@ def fit_intrinsics(
     return Intrinsics(*jnp.array([focal, focal, center, center], jnp.float32))
 
 
+def window(
+    camera: VirtualCamera, mesh: trimesh.Trimesh, T_object_camera: jaxlie.SE3, margin: float = 0.0
+) -> tuple[Intrinsics, tuple[int, int]]:
+    """The part of a camera's images that can show a mesh, the same for all views.
+
+    It holds the sphere around the mesh: rays outside meet nothing, so that nobody need cast them or
+    keep their pixels. Cameras that look at the centre from the distance of their kind have the same
+    window whatever the mesh is, and compiled programs serve for all.
+
+    Args:
+        camera: Its whole image is kept where its lens is fitted to the mesh.
+        mesh: In the object frame, metres.
+        T_object_camera: One pose per view.
+        margin: By how much the sphere is larger than the one around the mesh's bounding box, as a
+            share of its radius.
+
+    Returns:
+        Intrinsics whose principal point counts from the window's corner, and the window's height
+        and width in pixels.
+    """
+    if camera.field_of_view is None:
+        return fit_intrinsics(mesh, T_object_camera, camera.width), (camera.height, camera.width)
+    focal = camera.width / 2 / np.tan(np.deg2rad(camera.field_of_view) / 2)
+    image = np.array([camera.width, camera.height])
+    low, high = np.zeros(2), image
+    poses = np.asarray(T_object_camera.as_matrix())
+    center = np.einsum("vij,vi->vj", poses[:, :3, :3], mesh.bounds.mean(axis=0) - poses[:, :3, 3])
+    radius = (1 + margin) * mesh.scale / 2
+    if (center[:, 2] > radius).all():
+        middle = np.arctan2(center[:, :2], center[:, 2:])
+        reach = np.arcsin(radius / np.hypot(center[:, :2], center[:, 2:]))
+        low, high = (focal * np.tan(middle + sign * reach) for sign in (-1, 1))
+        low, high = low.min(axis=0) + image / 2, high.max(axis=0) + image / 2
+        low = (np.floor(low / WINDOW_STEP) * WINDOW_STEP).clip(0, image - 1)
+        high = (np.ceil(high / WINDOW_STEP) * WINDOW_STEP).clip(low + 1, image)
+    intrinsics = jnp.array([focal, focal, *(image / 2 - low)], jnp.float32)
+    return Intrinsics(*intrinsics), (int(high[1] - low[1]), int(high[0] - low[0]))
+
+
 def render_depth(
     mesh: trimesh.Trimesh,
     T_object_camera: jaxlie.SE3,
     intrinsics: Intrinsics,
-    image_size: int = IMAGE_SIZE,
+    image_size: int | tuple[int, int] = IMAGE_SIZE,
 ) -> tuple[Float[np.ndarray, "views h w"], Float[np.ndarray, "views h w"]]:
     """Depth images of a mesh, in metres, and the cosine at which each pixel meets its surface.
 
     Depth is infinite where the ray meets nothing; the cosine is 1 there. `T_object_camera` holds
-    one pose per view. True visibility: among all triangles on a ray the nearest counts.
+    one pose per view; `image_size` is the side of square images, or height and width. True
+    visibility: among all triangles on a ray the nearest counts.
     """
-    pixels = camera.unproject(intrinsics, jnp.ones((image_size, image_size)))
-    rays = np.asarray(pixels).reshape(-1, 3)  # z is 1, so the ray parameter is the depth
+    size = (image_size, image_size) if isinstance(image_size, int) else image_size
+    rays = _rays(intrinsics, size)
     poses = np.asarray(T_object_camera.as_matrix())
-    view, pixel = np.nonzero(_may_hit(mesh, poses, rays))
-    directions = (rays @ poses[:, :3, :3].swapaxes(1, 2))[view, pixel]
-    origins = poses[view, :3, 3]
-
-    triangle = mesh.ray.intersects_first(origins, directions)
-    hit = triangle >= 0
-    view, pixel, triangle, directions = view[hit], pixel[hit], triangle[hit], directions[hit]
-    normal = mesh.face_normals[triangle]
-    facing = np.sum(normal * directions, axis=1)
-    facing = np.where(np.abs(facing) > 1e-9, facing, np.nan)  # the ray lies in the plane
-    to_plane = np.sum(normal * (mesh.triangles[triangle, 0] - origins[hit]), axis=1)
-
-    depth = np.full((len(poses), len(rays)), np.inf, np.float32)
+    may_hit = _may_hit(mesh, poses, intrinsics, size).reshape(len(poses), -1)
+    corners, normals = mesh.triangles[:, 0], mesh.face_normals
+    depth = np.full(may_hit.shape, np.inf, np.float32)
     cosine = np.ones_like(depth)
-    depth[view, pixel] = np.nan_to_num(to_plane / facing, nan=np.inf)
-    cosine[view, pixel] = np.nan_to_num(np.abs(facing)) / np.linalg.norm(directions, axis=1)
-    shape = (-1, image_size, image_size)
-    return depth.reshape(shape), cosine.reshape(shape)
+    for i, pose in enumerate(poses):  # one by one, views stay in the processor's cache
+        pixel, origin = np.flatnonzero(may_hit[i]), pose[:3, 3]
+        directions = rays[pixel] @ pose[:3, :3].T
+        triangle = mesh.ray.intersects_first(np.broadcast_to(origin, directions.shape), directions)
+        hit = np.flatnonzero(triangle >= 0)
+        pixel, triangle, directions = pixel[hit], triangle[hit], directions[hit]
+        facing = _dot(normals[triangle], directions)
+        to_plane = _dot(normals, corners - origin)[triangle]
+        in_plane = np.abs(facing) <= 1e-9  # the ray lies in the plane
+        depth[i, pixel] = np.where(in_plane, np.inf, to_plane / np.where(in_plane, 1, facing))
+        length = np.sqrt(_dot(directions, directions))
+        cosine[i, pixel] = np.where(in_plane, 0, np.abs(facing)) / length
+    return depth.reshape(-1, *size), cosine.reshape(-1, *size)
+
+
+def _rays(intrinsics: Intrinsics, size: tuple[int, int]) -> Float[np.ndarray, "n 3"]:
+    """Directions through the centres of all pixels; z is 1, so the ray parameter is the depth."""
+    fx, fy, cx, cy = (np.float32(x) for x in intrinsics)
+    row, column = np.indices(size, np.float32) + np.float32(0.5)
+    one = np.float32(1)  # a product with the reciprocal, as compilers write divisions
+    rays = [(column - cx) * (one / fx), (row - cy) * (one / fy), np.ones_like(row)]
+    return np.stack(rays, axis=-1).reshape(-1, 3)
+
+
+def _dot(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def _corners(
@@ -103,15 +129,62 @@ def _corners(
 
 
 def _may_hit(
-    mesh: trimesh.Trimesh, poses: Float[np.ndarray, "views 4 4"], rays: Float[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, "views n"]:
-    """Rays inside the rectangle that the mesh's bounding box covers in each image, or all."""
-    corners = _corners(mesh, poses)
-    slopes = corners[..., :2] / corners[..., 2:]
-    low, high = slopes.min(axis=1)[:, None], slopes.max(axis=1)[:, None]
-    inside = ((rays[:, :2] >= low) & (rays[:, :2] <= high)).all(axis=-1)
-    # A box that reaches behind the camera covers no rectangle.
-    return inside | np.any(corners[..., 2] <= 0, axis=1, keepdims=True)
+    mesh: trimesh.Trimesh,
+    poses: Float[np.ndarray, "views 4 4"],
+    intrinsics: Intrinsics,
+    size: tuple[int, int],
+) -> Bool[np.ndarray, "views h w"]:
+    """Pixels in tiles that some triangle may touch: all that can hit, and few others."""
+    rows, columns = -(-size[0] // TILE), -(-size[1] // TILE)
+    points = (mesh.vertices - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+    depth = points[..., 2]
+    behind = np.asarray((depth <= 0).any(axis=1))  # such a mesh may be anywhere
+    fx, fy, cx, cy = (float(x) for x in intrinsics)
+    pixels = points[..., :2] * (fx, fy) / np.where(depth > 0, depth, 1)[..., None] + (cx, cy)
+    left, right = _ends(pixels[..., 0], mesh.faces, columns)
+    top, bottom = _ends(pixels[..., 1], mesh.faces, rows)
+    marked = _cover(left, right, top, bottom, (rows, columns)) | behind[:, None, None]
+    return marked.repeat(TILE, axis=1).repeat(TILE, axis=2)[:, : size[0], : size[1]]
+
+
+def _ends(
+    pixels: Float[np.ndarray, "views vertices"], faces: Int[np.ndarray, "faces 3"], count: int
+) -> tuple[Int[np.ndarray, "views faces"], Int[np.ndarray, "views faces"]]:
+    """First tile that each triangle may touch along one axis, and the one after its last."""
+    # A hundredth of a pixel makes up for rounding.
+    low = np.floor((pixels - 0.01) / TILE).astype(np.int32)
+    high = np.floor((pixels + 0.01) / TILE).astype(np.int32) + 1
+    a, b, c = (low[:, faces[:, i]] for i in range(3))
+    d, e, f = (high[:, faces[:, i]] for i in range(3))
+    first, last = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(d, e), f)
+    return first.clip(0, count), last.clip(0, count)
+
+
+def _cover(
+    left: Int[np.ndarray, "views n"],
+    right: Int[np.ndarray, "views n"],
+    top: Int[np.ndarray, "views n"],
+    bottom: Int[np.ndarray, "views n"],
+    shape: tuple[int, int],
+) -> Bool[np.ndarray, "views rows columns"]:
+    """Tiles inside any of the rectangles of their view.
+
+    A rectangle changes four entries of a difference image, whose sums along both axes count the
+    rectangles over each tile.
+    """
+    rows, columns = shape[0] + 1, shape[1] + 1
+    view = np.arange(len(left))[:, None] * rows * columns
+    changes = np.zeros(len(left) * rows * columns, np.int64)
+    for row, column, sign in (
+        (top, left, 1),
+        (top, right, -1),
+        (bottom, left, -1),
+        (bottom, right, 1),
+    ):
+        index = (view + row * columns + column).ravel()
+        changes += sign * np.bincount(index, minlength=len(changes))
+    counts = changes.reshape(-1, rows, columns).cumsum(axis=1).cumsum(axis=2)
+    return counts[:, :-1, :-1] > 0
 
 
 def add_sensor_noise(
@@ -122,30 +195,33 @@ def add_sensor_noise(
 ) -> Float[np.ndarray, "views h w"]:
     """What a real sensor would have reported; lost pixels become 0, nothing known."""
     noisy, (h, w) = depth.copy(), depth.shape[1:]
+    flat, rows = noisy.reshape(-1), np.arange(len(depth)) * h
     # Only edges show jitter across the image; elsewhere it would act as axial noise.
-    edges = view, row, column = np.nonzero(_is_edge(depth))
-    jitter = np.rint(rng.normal(0, noise.lateral, (2, len(view)))).astype(int)
+    edges = np.flatnonzero(np.stack([_is_edge(image) for image in depth]))
+    jitter = np.rint(rng.normal(0, noise.lateral, (2, len(edges)))).astype(int)
+    (view, row), column = divmod(edges // w, h), edges % w
     row, column = np.clip(row + jitter[0], 0, h - 1), np.clip(column + jitter[1], 0, w - 1)
-    noisy[edges] = depth[view, row, column]
+    flat[edges] = depth.reshape(-1)[(rows[view] + row) * w + column]
 
-    seen = np.nonzero(np.isfinite(noisy))
-    z = noisy[seen].astype(np.float64)
+    seen = np.flatnonzero(np.isfinite(flat))
+    z = flat[seen].astype(np.float64)
     z += rng.normal(0, noise.axial, z.shape) * z**2
     z = 1 / (noise.quantization * np.rint(1 / (noise.quantization * z)))  # steps of disparity
-    grazing = cosine[seen] < np.cos(np.deg2rad(noise.grazing))
-    noisy[seen] = np.where(grazing, 0, z)
-    lost = rng.random(len(view)) < noise.dropout
-    noisy[tuple(index[lost] for index in edges)] = 0
+    grazing = cosine.reshape(-1)[seen] < np.cos(np.deg2rad(noise.grazing))
+    flat[seen] = np.where(grazing, 0, z)
+    flat[edges[rng.random(len(edges)) < noise.dropout]] = 0
     return noisy
 
 
-def _is_edge(depth: Float[np.ndarray, "views h w"]) -> np.ndarray:
+def _is_edge(depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """True where a neighbour's depth differs by more than 5 %, or is of the background."""
     inverse = 1 / depth
+    tolerance = 0.05 * inverse.max()
+    down = np.abs(inverse[1:] - inverse[:-1]) > tolerance
+    right = np.abs(inverse[:, 1:] - inverse[:, :-1]) > tolerance
     edge = np.zeros(depth.shape, bool)
-    for axis in (1, 2):
-        ahead = np.abs(np.diff(inverse, axis=axis)) > 0.05 * inverse.max(axis=(1, 2), keepdims=True)
-        before, after = [(0, 0)] * 3, [(0, 0)] * 3
-        before[axis], after[axis] = (1, 0), (0, 1)
-        edge |= np.pad(ahead, before) | np.pad(ahead, after)
+    edge[1:] |= down
+    edge[:-1] |= down
+    edge[:, 1:] |= right
+    edge[:, :-1] |= right
     return edge

@@ -1,41 +1,122 @@
-"""The measurement grid F and the occlusion mask M of one object.
+"""How likely each voxel of a shape is surface, free or unknown, from its fine signed distances.
 
-Both come from fused frames (`fusion`, paper, Eq. 6). They are binary, as in the paper, or soft.
-Soft grids hold probabilities: in each voxel surface, free space and ignorance have the weights
-F (1 - M), (1 - F) (1 - M) and M, which sum to 1.
+The numbers below were fitted to procedural chairs under a Kinect's noise, after 1 to 18 frames: how
+often a voxel with so many crossings, or so much free space, holds a piece of the true surface.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
-Grid = Bool[Array, "*batch x y z"] | Float[Array, "*batch x y z"]
+from jaxshape.geometry.distance import DistanceField, mean_distance
+from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.geometry.grids import Grids
+
+OUTVOTED = 0.06
+"""A surface counts where its weight is more than this share of the rays that passed through it."""
+
+ALREADY, SCALE = 2.0, 4.3
+"""Fine voxels crossed by the surface, n, make a voxel surface with 1 - exp(-(n + 2) / 4.3): already
+a single one more likely than not."""
+
+SOME, ALL = 0.5, 0.95
+"""Shares of free fine voxels from which a voxel begins to be free, and is free for certain."""
 
 
-class Grids(NamedTuple):
-    """Measurement of an object, as shape models and residuals take it; leading axes are batch axes.
+class Evidence(NamedTuple):
+    """What the frames say about each voxel; the rest of the probability is unknown.
 
     Attributes:
-        occupied: **F** `[*batch x y z]`, True (or its probability, 0 to 1) where the surface was
-            measured. It counts only where the voxel is not occluded.
-        occluded: **M** `[*batch x y z]`, True (or its probability, 0 to 1) where nothing is known.
-        data: Further arrays that your own model or residual needs of each object: any pytree of
-            arrays with the same batch axes. None for none.
+        surface: Probability, 0 to 1, that the voxel holds a piece of the measured surface.
+        free: Probability, 0 to 1, that it was seen to be free; both add up to 1 at most.
     """
 
-    occupied: Grid
-    occluded: Grid
-    data: Any = None
+    surface: Float[Array, "*batch x y z"]
+    free: Float[Array, "*batch x y z"]
 
 
-def binary(grids: Grids) -> Grids:
-    """Round soft grids to the binary F and M of the paper.
+def evidence(field: DistanceField, resolution: int = RESOLUTION) -> Evidence:
+    """Probabilities of the voxels of a shape from a fused field.
 
     Args:
-        grids: Binary or soft grids `[*batch x y z]`; binary ones come back unchanged.
+        field: Signed distances of the fine grid, of a multiple of the resolution.
+        resolution: Voxels along each axis of the shape.
 
     Returns:
-        Grids of booleans: occluded where M is above 1/2, occupied where F is and M is not.
+        Probabilities of surface and free space.
     """
-    occluded = grids.occluded > 0.5
-    return grids._replace(occupied=(grids.occupied > 0.5) & ~occluded, occluded=occluded)
+    trusted, crossed = is_trusted(field), crossings(field)
+    ahead = (field.free > 0.5) | (trusted & (field.weighted_distance > 0))
+    count, free = _within_margin(_sum(crossed, resolution)), _share(ahead & ~crossed, resolution)
+    surface = jnp.where(count > 0, 1 - jnp.exp(-(count + ALREADY) / SCALE), 0)
+    return Evidence(surface, (1 - surface) * jnp.clip((free - SOME) / (ALL - SOME), 0, 1))
+
+
+def is_trusted(field: DistanceField) -> Bool[Array, "*batch x y z"]:
+    """Fine voxels whose distance counts: a surface was measured nearby and few rays contradict."""
+    return (field.weight > 0) & (field.weight > OUTVOTED * field.free)
+
+
+def crossings(field: DistanceField) -> Bool[Array, "*batch x y z"]:
+    """Fine voxels that the surface crosses: of each pair with different signs, the nearer to it."""
+    trusted, distance = is_trusted(field), mean_distance(field)
+    crossed = jnp.zeros(distance.shape, bool)
+    for axis in (-3, -2, -1):
+        size = distance.shape[axis]
+        (t0, d0), (t1, d1) = (
+            [lax.slice_in_dim(x, i, size - 1 + i, axis=axis) for x in (trusted, distance)]
+            for i in (0, 1)
+        )
+        cross = t0 & t1 & ((d0 > 0) != (d1 > 0))
+        first = jnp.abs(d0) <= jnp.abs(d1)
+        crossed |= _pad(cross & first, axis, (0, 1)) | _pad(cross & ~first, axis, (1, 0))
+    return crossed
+
+
+def _within_margin(count: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+    """Crossings in the outermost voxels, which the box leaves free, as of those next to them.
+
+    The box's own faces lie a hundredth of a voxel inside: noise alone takes a surface across.
+    """
+    n = count.shape[-1]
+    for axis in (-3, -2, -1):
+        first, second = (lax.slice_in_dim(count, i, i + 1, axis=axis) for i in (0, 1))
+        last, before = (lax.slice_in_dim(count, n - i, n - i + 1, axis=axis) for i in (1, 2))
+        inner = lax.slice_in_dim(count, 2, n - 2, axis=axis)
+        empty = jnp.zeros_like(first)
+        parts = [empty, first + second, inner, before + last, empty]
+        count = jnp.concatenate(parts, axis=axis)
+    return count
+
+
+def soft_grids(evidence: Evidence) -> Grids:
+    """F and M as probabilities; rounded (`binary`) they are the measurement grid and the mask.
+
+    Args:
+        evidence: What the frames say about each voxel.
+
+    Returns:
+        M is the probability of unknown voxels, F that of surface among the known ones.
+    """
+    known = evidence.surface + evidence.free
+    return Grids(evidence.surface / jnp.where(known > 0, known, 1), 1 - known)
+
+
+def _pad(x: Bool[Array, "*batch x y z"], axis: int, width: tuple[int, int]) -> Array:
+    widths = [(0, 0)] * x.ndim
+    widths[axis] = width
+    return jnp.pad(x, widths)
+
+
+def _sum(x: Array, resolution: int) -> Array:
+    """Sums over the fine voxels of each voxel."""
+    *batch, n, _, _ = x.shape
+    k = n // resolution
+    blocks = x.reshape(*batch, *[resolution, k] * 3)
+    return jnp.sum(blocks, axis=(-5, -3, -1), dtype=jnp.float32)
+
+
+def _share(x: Array, resolution: int) -> Array:
+    return _sum(x, resolution) / (x.shape[-1] // resolution) ** 3

@@ -15,7 +15,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from jaxshape.geometry.evidence import Grids, binary
+from jaxshape.geometry.grids import Grids, binary
 from jaxshape.model.config import Architecture
 from jaxshape.model.convolution import (
     KERNEL_SIZE,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.model.shapes import Prepared, ShapeModel, ShapePrior
 
 PASSES = 4

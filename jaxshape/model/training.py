@@ -31,7 +31,7 @@ from safetensors.numpy import save_file
 from jaxshape.data.dataset import Dataset
 from jaxshape.data.inputs import draw_pair
 from jaxshape.files import atomic_path, write_text
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import AUTOENCODER, AutoEncoder, architecture_of, initialize
 from jaxshape.model.config import TrainConfig

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from jaxshape.files import atomic_path
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.model.autoencoder import AUTOENCODER
 from jaxshape.model.pca import PCA
 from jaxshape.model.shapes import ShapeModel, ShapePrior, resolution_of

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.model.shapes import Precision, Prepared, ShapeModel, ShapePrior, pick
 from jaxshape.search.residuals import BALANCED, Residual
 from jaxshape.search.rows import hoisted, loss_over_rows, one_network, over_rows

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxshape.geometry.evidence import Grid, Grids, binary
+from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
@@ -53,22 +53,20 @@ class Reconstruction(NamedTuple):
     stop: Int[Array, " object"] | None
 
 
-def compose(
-    occupied: Grid, occluded: Grid, completed: Bool[Array, "*batch x y z"]
-) -> Bool[Array, "*batch x y z"]:
+def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*batch x y z"]:
     """Keep what was observed as measured; fill what was occluded with the completed shape.
 
     Args:
-        occupied: F `[*batch x y z]`; soft grids are rounded.
-        occluded: M `[*batch x y z]`; soft grids are rounded.
-        completed: The decoded shape `[*batch x y z]`, True where occupied.
+        occupied: F `[*batch x y z]`, binary or soft.
+        occluded: M `[*batch x y z]`, binary or soft.
+        completed: The decoded shape `[*batch x y z]`: True where occupied, or its probability.
 
     Returns:
-        The composed shape `[*batch x y z]`: F where something was measured, the completed shape
-        elsewhere.
+        The composed shape `[*batch x y z]`: True where (1 - M) F + M p is above 1/2. For binary
+        grids that is F where something was measured, and the completed shape elsewhere.
     """
-    measured = binary(Grids(occupied, occluded))
-    return jnp.where(measured.occluded, completed, measured.occupied)
+    F, M, p = (jnp.asarray(x).astype(jnp.float32) for x in (occupied, occluded, completed))
+    return (1 - M) * F + M * p > 0.5
 
 
 def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner | None:
@@ -194,7 +192,7 @@ def _reconstruction(
         completed_first=first_logits > 0,
         logits=logits,
         completed=completed,
-        composed=compose(grids.occupied, grids.occluded, completed),
+        composed=compose(grids.occupied, grids.occluded, jax.nn.sigmoid(logits)),
         first_objective=first_objective,
         objective=objective,
         trace=found and found.trace,

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxshape.geometry.evidence import Grid, Grids, binary
+from jaxshape.geometry.grids import Grid, Grids, binary
 
 
 class Residual(NamedTuple):
@@ -49,13 +49,18 @@ class Weights(NamedTuple):
             structures from drowning in free space.
         prior: Factor of alpha, the weight of the prior where nothing was measured, 0 or more (Eq.
             7: 1).
+        least_alpha: Lower bound of alpha, 0 or more (Eq. 7: 0). After many frames little is
+            occluded and alpha is small: the search then gives the hidden part up to fit the noise
+            of what was measured.
     """
 
     free: float = 1.0
     prior: Float[Array, ""] | float = 1.0
+    least_alpha: float = 0.0
 
 
 AS_PRINTED, LESS_FREE = Weights(), Weights(free=1 / 3)
+UNDER_NOISE = Weights(free=1 / 3, least_alpha=0.8)
 
 
 class Target(NamedTuple):
@@ -81,16 +86,16 @@ def weigh(
         weights: Weights of measured free space and of the prior; those of Eq. 7 by default.
 
     Returns:
-        The target of `cross_entropy`. alpha is sum(M) / sum(1 - M), times `weights.prior`; it is 0
-        where nothing is occluded, and where everything is, the sum over no voxels counts as one, so
-        that the prior alone decides.
+        The target of `cross_entropy`. alpha is sum(M) / sum(1 - M), at least `weights.least_alpha`,
+        times `weights.prior`; where everything is occluded, the sum over no voxels counts as one,
+        so that the prior alone decides.
     """
     axes = (-3, -2, -1)
     M = _as_weights(grids.occluded, first_logits)
     F = _as_weights(grids.occupied, first_logits)
     G0 = jax.nn.sigmoid(first_logits)
     alpha = M.sum(axes, keepdims=True) / jnp.maximum((1 - M).sum(axes, keepdims=True), 1)
-    alpha = weights.prior * alpha
+    alpha = weights.prior * jnp.maximum(alpha, weights.least_alpha)
     return Target(
         occupied=(1 - M) * F + alpha * M * G0,
         empty=weights.free * (1 - M) * (1 - F) + alpha * M * (1 - G0),
@@ -129,14 +134,16 @@ def equation_7(weights: Weights = AS_PRINTED) -> Residual:
     return Residual(lambda grids, logits: weigh(binary(grids), logits, weights), cross_entropy)
 
 
-def soft(weights: Weights = LESS_FREE) -> Residual:
+def soft(weights: Weights = UNDER_NOISE) -> Residual:
     """Eq. 7 with each voxel weighted by how sure its measurement is.
 
-    F and M are probabilities, as `soft_grids` gives them. A voxel that is known by half pulls half
-    as strongly towards what was measured there, and half towards the prior.
+    F and M are probabilities, as fused signed distances give them (`jaxshape.geometry.evidence`).
+    A voxel that is known by half pulls half as strongly towards what was measured there, and half
+    towards the prior.
 
     Args:
-        weights: Weights of free space and of the prior; those of `BALANCED` by default.
+        weights: Weights of free space and of the prior; by default those of `BALANCED` with alpha
+            at least 0.8.
     """
     return Residual(lambda grids, logits: weigh(grids, logits, weights), cross_entropy)
 
@@ -147,7 +154,8 @@ BALANCED = equation_7(LESS_FREE)
 """Eq. 7 with a third of the weight on measured free space: the best on procedural and CAD chairs,
 without noise and with it (experiments/objective.py)."""
 SOFT = soft()
-"""Eq. 7 as `BALANCED` weighs it, with each voxel weighted by how sure its measurement is."""
+"""Eq. 7 for soft grids under noise: each voxel is weighted by how sure its measurement is, measured
+free space counts a third, and the prior keeps its weight when little is hidden."""
 
 RESIDUALS = {"balanced": BALANCED, "paper": PAPER, "soft": SOFT}
 """The residuals by the names that `RefineConfig.objective` takes."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.model.shapes import Precision, ShapePrior, pick
 from jaxshape.search.objective import Evaluation, Penalty, evaluation, prepare_one
 from jaxshape.search.refiner import (

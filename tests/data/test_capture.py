@@ -6,6 +6,7 @@ import trimesh
 from scipy.ndimage import binary_dilation
 
 from jaxshape.data.capture import camera_distance, capture, discretize, measure_frames
+from jaxshape.data.virtual_cameras import VirtualCamera
 from jaxshape.geometry import camera, fusion, grid
 
 AZIMUTHS = jnp.repeat(jnp.arange(0.0, 360.0, 60.0), 2)
@@ -16,7 +17,7 @@ on_sphere = jax.jit(camera.on_sphere, static_argnums=2)
 def look_around(mesh, *, noise=False, seed=0):
     """12 views from above and below, around the whole object."""
     views = on_sphere(AZIMUTHS, ELEVATIONS, 1.5 * 0.5)
-    return capture(mesh, views, noise=noise, seed=seed, image_size=64)
+    return capture(mesh, views, noise=noise, seed=seed, camera=VirtualCamera(64, 64, None))
 
 
 def chair_like():

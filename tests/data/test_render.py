@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from jaxshape.data import render
-from jaxshape.data.render import SensorNoise
+from jaxshape.data.virtual_cameras import SensorNoise
 from jaxshape.geometry import camera
 
 SIZE = 48

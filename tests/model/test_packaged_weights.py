@@ -11,7 +11,7 @@ from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.dataset import TEST_SEEDS
 from jaxshape.geometry import camera, fusion
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import architecture_of
 from jaxshape.model.config import Architecture

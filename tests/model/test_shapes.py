@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.geometry.evidence import Grids, binary
+from jaxshape.geometry.grids import Grids, binary
 from jaxshape.model.shapes import (
     Prepared,
     ShapeModel,

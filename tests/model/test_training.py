@@ -12,7 +12,7 @@ from tiny_training import CONFIG, OBJECTS
 
 from jaxshape.data.config import InputConfig
 from jaxshape.data.dataset import unpack
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.model import training
 from jaxshape.model.config import PRESETS, Architecture
 from jaxshape.model.shapes import encode

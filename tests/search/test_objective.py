@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from programs import largest
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.model.shapes import decode
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner

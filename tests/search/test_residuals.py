@@ -8,15 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.search.residuals import (
     BALANCED,
+    LESS_FREE,
     PAPER,
     SOFT,
+    UNDER_NOISE,
     Target,
     Weights,
     cross_entropy,
     equation_7,
+    soft,
     weigh,
 )
 
@@ -174,19 +177,28 @@ def test_leading_axes_are_a_batch():
 # --- how sure a voxel is -----------------------------------------------------------------------
 
 
-def test_where_all_is_sure_soft_is_balanced():
+def test_where_all_is_sure_soft_is_balanced_but_for_the_least_alpha():
     occupied, occluded = random_grids(2)
     logits = random_logits()
     grids = Grids(occupied & ~occluded, occluded)
     certain = jax.tree.map(lambda x: x.astype(jnp.float32), grids)
-    expected = BALANCED.target(grids, logits)
-    jax.tree.map(np.testing.assert_array_equal, SOFT.target(certain, logits), expected)
+    found = soft(LESS_FREE).target(certain, logits)
+    jax.tree.map(np.testing.assert_array_equal, found, BALANCED.target(grids, logits))
+
+
+def test_the_prior_keeps_its_weight_where_little_is_hidden():
+    occluded = jnp.zeros(SHAPE).at[0, 0].set(1)
+    target = SOFT.target(Grids(1 - occluded, occluded), random_logits())
+    weight = (target.occupied + target.empty)[occluded > 0]
+    np.testing.assert_allclose(weight, UNDER_NOISE.least_alpha, rtol=1e-5)
+    printed = PAPER.target(Grids(occluded == 0, occluded > 0), random_logits())
+    assert (printed.occupied + printed.empty)[occluded > 0].max() < 0.1
 
 
 def test_a_voxel_counts_as_much_as_it_is_known():
     """At M = 1/4 a measured voxel pulls with 3/4, and the prior with 1/4 of alpha."""
     F, M = jnp.ones(SHAPE), jnp.full(SHAPE, 0.25)
-    target = SOFT.target(Grids(F, M), jnp.zeros(SHAPE))
+    target = soft(LESS_FREE).target(Grids(F, M), jnp.zeros(SHAPE))
     alpha = 0.25 / 0.75
     np.testing.assert_allclose(target.occupied, 0.75 + alpha * 0.25 * 0.5, rtol=1e-6)
     np.testing.assert_allclose(target.empty, alpha * 0.25 * 0.5, rtol=1e-6)

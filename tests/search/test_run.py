@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.geometry.evidence import Grids
+from jaxshape.geometry.grids import Grids
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.refiner import StopReason

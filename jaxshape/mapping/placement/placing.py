@@ -28,8 +28,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape import checks
 from jaxshape.geometry import fusion, grid
-from jaxshape.geometry.evidence import Grids
 from jaxshape.geometry.grid import MARGIN
+from jaxshape.geometry.grids import Grids
 from jaxshape.mapping.placement.rays import RaySamples
 from jaxshape.model.shapes import ShapePrior, decode_prepared, encode, pick
 from jaxshape.search.batching import select

@@ -1,0 +1,98 @@
+"""Depth cameras that a virtual one can stand for."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from jaxshape import checks
+from jaxshape.geometry import sensor
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """The faults of a structured-light sensor such as the first Kinect.
+
+    Standard deviations and steps grow with the square of depth, see `jaxshape.geometry.sensor`.
+
+    Attributes:
+        axial: Standard deviation along the ray, in metres at 1 m; grows with the square of depth.
+        lateral: Standard deviation across the image, in pixels (0.8 of the Kinect's, which are
+            smaller).
+        quantization: Step of the measured depth, in metres at 1 m; grows with the square of depth.
+        dropout: Probability that a pixel at a depth edge is lost, 0 to 1.
+        grazing: Surfaces seen at more than this angle from their normal are lost, in degrees.
+    """
+
+    axial: float = sensor.AXIAL
+    lateral: float = 0.3
+    quantization: float = sensor.STEP
+    dropout: float = 0.3
+    grazing: float = 80.0
+
+    def __post_init__(self) -> None:
+        checks.at_least("axial", self.axial, 0)
+        checks.at_least("lateral", self.lateral, 0)
+        checks.positive("quantization", self.quantization, "metres")
+        checks.within("dropout", self.dropout, 0, 1)
+        checks.within("grazing", self.grazing, 0, 180)
+
+
+@dataclass(frozen=True)
+class VirtualCamera:
+    """A depth camera, and where it usually stands.
+
+    Attributes:
+        width: Pixels along each row.
+        height: Pixels along each column.
+        field_of_view: Across the width, in degrees; None for the longest lens with which every
+            view sees the whole object, as in the paper.
+        distance: From the camera to the object's centre, in diagonals of its bounding box.
+        noise: The faults of its sensor, where noise is asked for.
+    """
+
+    width: int
+    height: int
+    field_of_view: float | None
+    distance: float = 1.5
+    noise: SensorNoise = field(default_factory=SensorNoise)
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 1:
+            raise ValueError(
+                f"A camera of {self.width} x {self.height} pixels sees nothing; give 1 or more."
+            )
+        if self.field_of_view is not None and not 0 < self.field_of_view < 180:
+            raise ValueError(
+                f"field_of_view must lie between 0 and 180 degrees, but is {self.field_of_view}."
+            )
+        if self.field_of_view is None and self.width != self.height:
+            raise ValueError(
+                f"Only square images have a lens fitted, but {self.width} x {self.height} pixels "
+                "were given; give a field of view, or as many rows as columns."
+            )
+        if not self.distance > 0.5:
+            raise ValueError(
+                "A camera must stand outside the object, more than 0.5 diagonals from its centre, "
+                f"but distance is {self.distance}."
+            )
+
+
+CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]
+
+CAMERAS: dict[CameraName, VirtualCamera] = {
+    # The paper does not give the size of its images.
+    "paper": VirtualCamera(96, 96, None),
+    # The first Kinect, of a focal length of 525 pixels; a chair of 0.85 m then stands 2 m away.
+    "kinect": VirtualCamera(640, 480, 62.7, 1.8),
+    # D435: 87 degrees over 848 pixels of which 640 are kept; an error of 0.08 pixels of disparity
+    # between sensors that are 50 mm apart.
+    "realsense": VirtualCamera(
+        640, 480, 71.2, 1.3, SensorNoise(4e-3, 0.5, 1e-4, dropout=0.5, grazing=85.0)
+    ),
+    # A grid of points through which a network draws surfaces, so that edges are soft, nothing is
+    # lost, and the error is about 1 cm in a room (Luetzenburg et al., Scientific Reports, 2021).
+    "iphone-lidar": VirtualCamera(
+        256, 192, 62.0, 1.2, SensorNoise(3e-3, 0.6, 1e-3, dropout=0.0, grazing=88.0)
+    ),
+}
+"""Cameras by name. Distances put some 240 pixels of a Kinect on a chair; people stand nearer with
+a wider lens or fewer pixels."""

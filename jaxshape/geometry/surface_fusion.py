@@ -1,0 +1,192 @@
+"""One mesh of what was measured and what was decoded, at the resolution of the fine grid. [host]
+
+The measured surface is where the fused signed distance changes its sign. Where nothing was
+measured, decoded logits stand for a distance. From the edge of what was measured its distance is
+carried on, and fades out over a voxel and a half, so that both surfaces meet without a step.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import trimesh
+from jaxtyping import Array, Bool, Float
+from scipy import ndimage
+from skimage.measure import label, marching_cubes
+
+from jaxshape.geometry import evidence
+from jaxshape.geometry.distance import DistanceField, mean_distance
+from jaxshape.geometry.grid import RESOLUTION, GridFrame
+
+REACH = 1.5
+"""Voxels over which measured distances fade out beyond the edge of what was measured."""
+
+NATS = 0.25
+"""Logits at the decoded surface: above 0, for occupied voxels reach beyond what they hold."""
+
+NATS_PER_VOXEL = 6.0
+"""How steeply logits rise across a decoded surface."""
+
+DEEP = 1.5
+"""Fine voxels behind a surface down to which its distances are taken as they are."""
+
+FAR, NEAR = 3.0, 1.5
+"""Fine voxels at which distances end, and within which a measured surface is nearby."""
+
+LITTLE = 0.03
+"""Weight at which a measured distance and the smooth surface around it count the same."""
+
+CRUMB = 0.01
+"""Share of the largest piece's area below which a loose piece is dropped wherever it lies."""
+
+FLOOR = 1.0
+"""Voxels above the lowest occupied height within which a loose piece stands on the floor."""
+
+
+class FusedSurface(NamedTuple):
+    """A mesh, and where it comes from.
+
+    Attributes:
+        mesh: In the object frame, metres; normals point outwards.
+        measured: True for vertices on the measured surface, False for predicted ones.
+        dropped: How many loose pieces were left out.
+    """
+
+    mesh: trimesh.Trimesh
+    measured: Bool[np.ndarray, " n"]
+    dropped: int
+
+
+def fuse_surface(
+    field: DistanceField, logits: Float[Array | np.ndarray, "x y z"], frame: GridFrame
+) -> FusedSurface:
+    """The measured surface, completed by the decoded shape where nothing was measured.
+
+    Args:
+        field: Of one object.
+        logits: Its decoded shape, 32 voxels along each side.
+        frame: Of the decoded grid, in the object frame.
+
+    Returns:
+        A closed mesh, except for loose pieces that touch neither the largest piece nor the floor.
+
+    Raises:
+        ValueError: Where neither a surface was measured nor a shape decoded.
+    """
+    fine = field.weight.shape[-1]
+    scale = RESOLUTION / fine * np.asarray(frame.voxel_size, np.float64)
+    distance, measured = combine(field, np.asarray(logits), float(scale.max()))
+    if not (distance < 0).any():
+        raise ValueError(
+            "There is no surface: nothing was measured inside the box and no logit is above "
+            f"{NATS}. Check the box and the segmentation."
+        )
+    padded = np.pad(distance, 1, constant_values=max(distance.max(), 1e-3))  # closed at the border
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent")
+    vertices -= 0.5  # of the padded grid, whose first centre is at -0.5
+    at = np.clip(np.rint(vertices - 0.5), 0, fine - 1).astype(int)
+    mesh = trimesh.Trimesh(
+        np.asarray(frame.origin, np.float64) + vertices * scale, faces, process=False
+    )
+    if mesh.volume < 0:
+        mesh.invert()
+    return _without_loose_pieces(mesh, measured[tuple(at.T)], float(frame.voxel_size[1]))
+
+
+def combine(
+    field: DistanceField, logits: Float[np.ndarray, "x y z"], voxel: float
+) -> tuple[Float[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
+    """Signed distances of the whole shape, and where a surface was measured.
+
+    Args:
+        field: Of one object.
+        logits: Its decoded shape.
+        voxel: Metres that count as 1 in the distances: the side of a fine voxel.
+
+    Returns:
+        Distances at the centres of fine voxels, and True next to the measured surface.
+    """
+    measured, trusted, free, seen_free = jax.device_get(_measured(field))
+    measured = measured / voxel
+    trusted = trusted & (measured > -DEEP)
+    decoded = _decoded(logits, seen_free, len(measured) // RESOLUTION)
+    if not trusted.any():
+        return decoded, trusted
+    distance = _carried_on(measured, trusted, decoded)
+    # Free space is smoothed as a whole, so that single rays leave neither holes nor spikes.
+    passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
+    distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), FAR * (2 * passed - 1))
+    weight = np.where(trusted, np.asarray(field.weight), 0)
+    certainty = weight**2 / (weight**2 + LITTLE**2)
+    distance = certainty * measured + (1 - certainty) * distance
+    return _filled(distance, free), trusted & (np.abs(measured) < NEAR)
+
+
+@jax.jit
+def _measured(field: DistanceField) -> tuple[Array, Array, Array, Array]:
+    free = evidence.evidence(field).free
+    return mean_distance(field), evidence.is_trusted(field), field.free > 0.5, free
+
+
+def _decoded(
+    logits: Float[np.ndarray, "x y z"], free: Float[np.ndarray, "x y z"], scale: int
+) -> Float[np.ndarray, "X Y Z"]:
+    """Logits as distances, in fine voxels; voxels that were seen to be free are not filled."""
+    occupied = ((1 - free) / (1 + np.exp(-logits))).clip(1e-6, 1 - 1e-6)
+    logits = np.log(occupied / (1 - occupied))
+    return _upsample((NATS - logits) / NATS_PER_VOXEL * scale, scale).clip(-FAR, FAR)
+
+
+def _carried_on(
+    measured: Float[np.ndarray, "X Y Z"],
+    trusted: Bool[np.ndarray, "X Y Z"],
+    decoded: Float[np.ndarray, "X Y Z"],
+) -> Float[np.ndarray, "X Y Z"]:
+    """Measured distances that fade into decoded ones beyond the edge of what was measured."""
+    nearest = np.asarray(
+        ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
+    )
+    away = np.sqrt(((nearest - np.indices(trusted.shape, np.int32)) ** 2).sum(axis=0))
+    share = np.clip(1 - away / (REACH * len(trusted) / RESOLUTION), 0, 1)
+    return share * measured[tuple(nearest)].clip(-FAR, FAR) + (1 - share) * decoded
+
+
+def _upsample(coarse: Float[np.ndarray, "x y z"], scale: int) -> Float[np.ndarray, "X Y Z"]:
+    """Linear between voxel centres, constant beyond the outermost."""
+    at = (np.arange(scale * len(coarse)) + 0.5) / scale - 0.5
+    for axis in range(3):
+        low = np.clip(np.floor(at).astype(int), 0, coarse.shape[axis] - 2)
+        share = np.clip(at - low, 0, 1).reshape([-1 if i == axis else 1 for i in range(3)])
+        coarse = (1 - share) * np.take(coarse, low, axis) + share * np.take(coarse, low + 1, axis)
+    return coarse
+
+
+def _filled(
+    distance: Float[np.ndarray, "X Y Z"], free: Bool[np.ndarray, "X Y Z"]
+) -> Float[np.ndarray, "X Y Z"]:
+    """The shape without cavities: shells hide the inside of solids, which no frame sees."""
+    outside = np.pad(distance > 0, 1, constant_values=True)
+    labels = np.asarray(label(outside, connectivity=1))
+    seen = np.zeros(labels.max() + 1, bool)
+    seen[labels[1:-1, 1:-1, 1:-1][free & (distance > 0)]] = True
+    seen[labels[0, 0, 0]] = True
+    cavity = (labels > 0) & ~seen[labels]
+    return np.where(cavity[1:-1, 1:-1, 1:-1], -1.0, distance)
+
+
+def _without_loose_pieces(
+    mesh: trimesh.Trimesh, measured: Bool[np.ndarray, " n"], voxel: float
+) -> FusedSurface:
+    """Keep the largest piece, and those that stand on the floor with it."""
+    labels = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))
+    area = np.bincount(labels[mesh.faces[:, 0]], weights=mesh.area_faces)
+    lowest = np.full(len(area), np.inf)
+    np.minimum.at(lowest, labels, mesh.vertices[:, 1])
+    main = int(np.argmax(area))
+    keep = (lowest < mesh.vertices[:, 1].min() + FLOOR * voxel) & (area > CRUMB * area[main])
+    keep[main] = True
+    vertex = keep[labels]
+    index = np.cumsum(vertex) - 1
+    faces = index[mesh.faces[vertex[mesh.faces[:, 0]]]]
+    kept = trimesh.Trimesh(mesh.vertices[vertex], faces, process=False)
+    return FusedSurface(kept, measured[vertex], int((~keep).sum()))

@@ -1,0 +1,79 @@
+"""Left and right of an object as evidence of each other, where what was measured of both agrees."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxshape.geometry.evidence import Evidence
+
+NATS = 3.0
+"""What a seen mirror image adds to the log-odds of an unknown voxel."""
+
+AGREEMENT = 0.8
+"""Share of the surface measured on both sides that must agree: most chairs reach .9."""
+
+
+class Mirrored(NamedTuple):
+    """What the other side of an object says.
+
+    Attributes:
+        logits: Nats to add to those of a decoded shape, 0 where a voxel was seen itself.
+        symmetric: Whether both sides agree where both were measured; logits are 0 where not.
+        agreement: The share of the surface measured on both sides that agrees; 1 without any.
+    """
+
+    logits: Float[Array, "*batch x y z"]
+    symmetric: Bool[Array, "*batch"]
+    agreement: Float[Array, "*batch"]
+
+
+def mirror(x: Array) -> Array:
+    """The grid of the object with left and right exchanged."""
+    return jnp.flip(x, axis=-3)
+
+
+def mirrored(evidence: Evidence, nats: float = NATS) -> Mirrored:
+    """Evidence about unknown voxels from their mirror images, where the object is symmetric.
+
+    A surface voxel that a grid places one voxel off still agrees: what contradicts symmetry is a
+    surface whose mirror image, and all that is next to it, was seen to be free.
+
+    Args:
+        evidence: Of one object, in a frame whose x-axis points across the plane of symmetry.
+        nats: What a mirror image seen for certain adds.
+
+    Returns:
+        The nats, and how well the sides agree.
+    """
+    surface, free = evidence
+    axes = (-3, -2, -1)
+    other_free = mirror(free)
+    denied = surface * _least_nearby(other_free)
+    agreed = surface * mirror(_greatest_nearby(surface))
+    both = denied.sum(axes) + agreed.sum(axes)
+    agreement = jnp.where(both > 0, agreed.sum(axes) / jnp.where(both > 0, both, 1), 1.0)
+    symmetric = agreement > AGREEMENT
+    unknown = 1 - surface - free
+    logits = nats * unknown * (mirror(surface) - other_free)
+    return Mirrored(jnp.where(symmetric[..., None, None, None], logits, 0.0), symmetric, agreement)
+
+
+def symmetrised(
+    logits: Float[Array, "*batch x y z"], found: Mirrored
+) -> Float[Array, "*batch x y z"]:
+    """Logits averaged with their mirror image, plus what it showed; as given if not symmetric."""
+    symmetric = found.symmetric[..., None, None, None]
+    return jnp.where(symmetric, (logits + mirror(logits)) / 2, logits) + found.logits
+
+
+def _greatest_nearby(x: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+    """The greatest value among each voxel and its 26 neighbours."""
+    for axis in (-3, -2, -1):
+        before, after = (jnp.roll(x, shift, axis) for shift in (1, -1))  # borders are free
+        x = jnp.maximum(x, jnp.maximum(before, after))
+    return x
+
+
+def _least_nearby(x: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+    return -_greatest_nearby(-x)
