@@ -272,7 +272,9 @@ def searcher(method: str, prior: ShapePrior, config: RefineConfig) -> Callable[.
 
     @jax.jit
     def search(keys, prior, case, codes):
-        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, config, codes)
+        found = reconstruct(
+            keys, prior, case.occupied, case.occluded, refiner, config, earlier=codes
+        )
         return Ends(found.code, found.objective, iou(found.completed, case.surface))
 
     return search

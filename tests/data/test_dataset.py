@@ -163,7 +163,7 @@ def test_the_share_of_noisy_objects_is_the_one_asked_for(monkeypatch):
     """Clean depth is used below the share, and faulty depth above: seen by what is captured."""
     noisy = []
 
-    def stop(mesh, poses, *, noise, seed):
+    def stop(mesh, poses, *, noise, seed, resolution):
         noisy.append(noise)
         raise StopIteration
 

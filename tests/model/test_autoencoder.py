@@ -190,9 +190,9 @@ def test_the_number_of_layers_decides_the_resolution(layers, resolution):
 @pytest.mark.parametrize(
     "sizes, said",
     [
-        (((8, 8), (8, 8)), "encoder has 2 layers and decoder 2 entries"),
-        (((8,), ()), "at least one entry for the decoder"),
-        (((8, 8, 0), (8, 8)), "at least 1"),
+        (((8, 8), (8, 8)), "The encoder has 2 layers and the decoder 2 numbers"),
+        (((8,), ()), r"decoder is \(\); give numbers of channels"),
+        (((8, 8, 0), (8, 8)), r"encoder is \(8, 8, 0\); give numbers of channels"),
     ],
 )
 def test_layers_that_do_not_match_are_refused(sizes, said):

@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxshape.model.pca import PCA
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.space import fold, raw, whitened
 
 BOUND = 2.0
 SQUARE = jnp.array([[2.0, 0.0, 0.0], [1.0, 0.5, 0.0], [-1.0, 0.3, 0.1]])
-PRIOR = ShapePrior({}, jnp.array([1.0, -2.0, 3.0]), SQUARE @ SQUARE.T)
+PRIOR = ShapePrior(PCA, {}, jnp.array([1.0, -2.0, 3.0]), SQUARE @ SQUARE.T)
 numbers = st.floats(-50, 50, width=32)
 
 
@@ -25,7 +26,9 @@ def test_the_white_space_has_the_mean_and_the_covariance_of_the_codes():
     np.testing.assert_allclose(whitened(PRIOR).root, SQUARE, rtol=1e-4)
 
 
-@pytest.mark.parametrize("space", [whitened(PRIOR), raw(3), whitened(PRIOR, 9.0), raw(3, 9.0)])
+@pytest.mark.parametrize(
+    "space", [whitened(PRIOR), raw(PRIOR), whitened(PRIOR, 9.0), raw(PRIOR, 9.0)]
+)
 def test_a_code_comes_back_from_its_point(space):
     code = PRIOR.code_mean + jnp.array([0.3, 0.2, -0.1])
     np.testing.assert_allclose(space.to_code(space.from_code(code)), code, atol=1e-5)
@@ -33,7 +36,7 @@ def test_a_code_comes_back_from_its_point(space):
 
 def test_raw_points_are_codes():
     code = jnp.array([3.0, -1e4, 1e-4])
-    np.testing.assert_array_equal(raw(3).to_code(code), code)
+    np.testing.assert_array_equal(raw(PRIOR).to_code(code), code)
 
 
 @settings(max_examples=20, deadline=None)

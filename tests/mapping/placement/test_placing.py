@@ -54,7 +54,7 @@ def test_boxes_hold_the_points_stand_on_the_floor_and_reach_away_from_the_camera
     boxes = placing.propose(seen, jnp.array(-0.7), CONFIG)
     assert len(boxes.yaw) == CONFIG.yaws * len(CONFIG.overhangs)
     np.testing.assert_allclose(boxes.lower[:, 1], -0.7)
-    voxels = jax.vmap(lambda box: placing.to_voxels(box, seen.surface))(boxes)
+    voxels = jax.vmap(lambda box: placing.to_voxels(box, seen.surface, 32))(boxes)
     assert ((voxels > 0.5) & (voxels < 31.5)).all(axis=-1).mean() > 0.98
     tight, wide = (jax.tree.map(lambda x, n=n: x[n], boxes) for n in (0, CONFIG.yaws))
     assert wide.yaw == tight.yaw == 0
@@ -66,7 +66,7 @@ def test_boxes_hold_the_points_stand_on_the_floor_and_reach_away_from_the_camera
 
 def test_the_box_fills_the_grid():
     corners = jnp.stack([BOX.lower, BOX.upper]) @ placing.turn(BOX.yaw).T
-    voxels = placing.to_voxels(BOX, corners)
+    voxels = placing.to_voxels(BOX, corners, 32)
     np.testing.assert_allclose(voxels, [[1.01] * 3, [30.99] * 3], atol=1e-4)
 
 
