@@ -37,9 +37,9 @@ from jaxshape.data.virtual_cameras import CAMERAS
 from jaxshape.geometry import camera, evidence
 from jaxshape.geometry.distance import fine_frame
 from jaxshape.geometry.grids import Grids, binary
-from jaxshape.geometry.surface_fusion import fuse_surface
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.results.fused_surface import fuse_surface
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.surface import surface

@@ -10,7 +10,7 @@ from .data.sequences import (
     read_trajectory,
     write_trajectory,
 )
-from .data.virtual_cameras import CAMERAS, SensorNoise, VirtualCamera
+from .data.virtual_cameras import SensorNoise, VirtualCamera, virtual_camera
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
@@ -73,7 +73,6 @@ from .search.space import LatentSpace, raw, whitened
 from .search.stopping import Tolerances
 
 __all__ = [
-    "CAMERAS",
     "Architecture",
     "BALANCED",
     "Bounds",
@@ -106,8 +105,8 @@ __all__ = [
     "Residual",
     "SOFT",
     "Segmentation",
-    "ShapeModel",
     "SensorNoise",
+    "ShapeModel",
     "ShapePrior",
     "ShapeScores",
     "Skipped",
@@ -176,6 +175,7 @@ __all__ = [
     "summarise",
     "surface",
     "trajectory",
+    "virtual_camera",
     "weigh",
     "whitened",
     "with_restarts",

@@ -115,6 +115,14 @@ def followed(known, mapper):
     return followed
 
 
+@pytest.fixture(scope="module")
+def compile_quickly():
+    """Compiling takes most of the time of many tests, and their arithmetic is small."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture
 def unchecked_types(monkeypatch):
     """Types are not checked while a test runs, as in a user's program."""

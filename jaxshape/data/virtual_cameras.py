@@ -20,6 +20,9 @@ class SensorNoise:
         quantization: Step of the measured depth, in metres at 1 m; grows with the square of depth.
         dropout: Probability that a pixel at a depth edge is lost, 0 to 1.
         grazing: Surfaces seen at more than this angle from their normal are lost, in degrees.
+
+    Raises:
+        ValueError: A value is outside its range.
     """
 
     axial: float = sensor.AXIAL
@@ -47,6 +50,10 @@ class VirtualCamera:
             view sees the whole object, as in the paper.
         distance: From the camera to the object's centre, in diagonals of its bounding box.
         noise: The faults of its sensor, where noise is asked for.
+
+    Raises:
+        ValueError: The image is empty, the camera stands inside the object, or the field of view
+            does not fit the image.
     """
 
     width: int
@@ -96,3 +103,16 @@ CAMERAS: dict[CameraName, VirtualCamera] = {
 }
 """Cameras by name. Distances put some 240 pixels of a Kinect on a chair; people stand nearer with
 a wider lens or fewer pixels."""
+
+
+def virtual_camera(name: CameraName) -> VirtualCamera:
+    """A depth camera by name, at the distance at which people hold it.
+
+    Args:
+        name: "kinect", "realsense", "iphone-lidar", or "paper" for the paper's square images.
+
+    Raises:
+        ValueError: There is no camera of that name.
+    """
+    checks.one_of("camera", name, CAMERAS)
+    return CAMERAS[name]

@@ -27,7 +27,12 @@ FINE = 4
 
 
 class Band(NamedTuple):
-    """A distance from the surface: the greater of some fine voxels and some deviations of depth."""
+    """A distance from the surface: the greater of some fine voxels and some deviations of depth.
+
+    Attributes:
+        voxels: Fine voxels, in their longest edge.
+        deviations: Standard deviations of the depth measured there.
+    """
 
     voxels: float
     deviations: float

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from jaxshape.data import render
 from jaxshape.data.capture import camera_distance, capture, fuse_frames, sensor_of
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.dataset import TEST_SEEDS
-from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
+from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera, virtual_camera
 from jaxshape.geometry import camera, distance
 from jaxshape.geometry.camera import Intrinsics
 
@@ -102,7 +104,7 @@ def test_a_sensor_is_as_exact_as_the_camera_it_belongs_to():
             wall + np.linspace(0, 0.05, 100, dtype=np.float32),
             np.ones_like(wall),
             np.random.default_rng(0),
-            device.noise._replace(dropout=0.0),
+            replace(device.noise, dropout=0.0),
         )
         error = (noisy - wall - np.linspace(0, 0.05, 100))[:, 2:-2, 2:-2]
         np.testing.assert_allclose(error.std(), 4 * sensor_of(device).axial, rtol=0.12)
@@ -120,3 +122,9 @@ def test_a_sensor_is_as_exact_as_the_camera_it_belongs_to():
 def test_impossible_cameras_are_refused(wrong, said):
     with pytest.raises(ValueError, match=said):
         VirtualCamera(*wrong)
+
+
+def test_cameras_go_by_name(unchecked_types):
+    assert virtual_camera("kinect") is KINECT
+    with pytest.raises(ValueError, match="camera is 'xtion'; give 'paper' or 'kinect'"):
+        virtual_camera("xtion")

@@ -27,9 +27,9 @@ def source(name: str) -> str:
 def answer(tmp_path, monkeypatch, capsys, unchecked_types):
     """Run an example in small, in its folder; returns the numbers that it prints."""
 
-    def answer(name: str) -> list[float]:
+    def answer(name: str, more: dict[str, str] | None = None) -> list[float]:
         code = source(name)
-        for said, done in INSTEAD[name].items():
+        for said, done in (INSTEAD[name] | (more or {})).items():
             assert said in code, f"{name} no longer says {said!r}"
             code = code.replace(said, done)
         (tmp_path / name).write_text(code)
@@ -65,6 +65,14 @@ def test_the_decoder_fits_chairs_that_it_never_saw(answer):
     assert 0 < first < last - 0.03
 
 
+def test_outlines_reach_the_search(answer, linear_weights):
+    """With a prior that compiles at once, and knows no chairs: the shapes differ."""
+    quick = {"js.load_prior()": f"js.load_prior({str(linear_weights)!r})", ":.2f": ":.5f"}
+    alone, outlined = answer("own_residual.py", quick)
+    assert alone != outlined
+
+
+@pytest.mark.slow
 def test_outlines_make_shapes_better(answer):
     alone, outlined = answer("own_residual.py")
     assert outlined > alone

@@ -43,7 +43,7 @@ def ball():
 
 
 def centers(frame):
-    points = grid.voxel_centers(distance.fine_frame(frame, N), N)
+    points = grid.object_from_voxel(distance.fine_frame(frame, N), grid.voxel_centers(N))
     return np.asarray(points).reshape(N, N, N, 3)
 
 

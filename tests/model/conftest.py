@@ -1,6 +1,5 @@
 from typing import Any, NamedTuple
 
-import jax
 import pytest
 import tiny_training
 
@@ -9,11 +8,8 @@ from jaxshape.model.weights import load_prior, save_prior
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compile_quickly():
-    """Compiling takes most of the time of these tests, and their arithmetic is small."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+def quickly(compile_quickly):
+    """All of these tests compile without optimisation."""
 
 
 class Run(NamedTuple):

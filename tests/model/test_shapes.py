@@ -58,10 +58,9 @@ def test_leading_axes_are_a_batch(batch):
     logits = jax.jit(decode)(PRIOR, codes)
     for i in np.ndindex(batch):
         one = jax.tree.map(lambda x, i=i: x[i][None], seen)
-        np.testing.assert_allclose(codes[i], _encode(PARAMS, one)[0], rtol=1e-5)
-        np.testing.assert_allclose(
-            logits[i], _decode(Prepared(PARAMS), codes[i][None])[0], rtol=1e-4
-        )
+        np.testing.assert_allclose(codes[i], _encode(PARAMS, one)[0], rtol=1e-4, atol=1e-5)
+        expected = _decode(Prepared(PARAMS), codes[i][None])[0]
+        np.testing.assert_allclose(logits[i], expected, rtol=1e-4, atol=1e-4)
 
 
 def test_each_code_is_decoded_with_its_own_objects_features():

@@ -35,14 +35,6 @@ class Counter:
 
 
 @pytest.fixture(scope="module")
-def compile_quickly():
-    """Compiling takes most of the time of these tests, and their arithmetic is small."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
-@pytest.fixture(scope="module")
 def counter(compile_quickly):
     """Counts codes, which are decoded one at a time."""
     with pytest.MonkeyPatch.context() as patch:

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,6 +24,7 @@ def test_capacities_double_and_hold_every_map(count):
     assert capacity_for(capacity) == capacity and capacity_for(capacity + 1) == 2 * capacity
 
 
+@pytest.mark.slow
 def test_a_map_of_more_than_512_keyframes_is_realigned(monkeypatch, linear_prior):
     """What the joint problem is asked: all keyframes, padded, each with its own odometry."""
     asked = []

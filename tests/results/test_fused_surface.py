@@ -9,7 +9,7 @@ import trimesh
 from jaxshape.data.render import fit_intrinsics, render_depth
 from jaxshape.geometry import camera, distance, grid
 from jaxshape.geometry.pixels import Sensor
-from jaxshape.geometry.surface_fusion import fuse_surface
+from jaxshape.results.fused_surface import fuse_surface
 
 SIZE = 200
 CLEAN = Sensor(axial=3e-4)
