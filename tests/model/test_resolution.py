@@ -29,7 +29,7 @@ def test_a_network_of_another_resolution_trains_refines_and_meshes(tmp_path, enc
     list(build_dataset(tmp_path / "d", range(8), DatasetConfig(views=2, resolution=n), workers=1))
     dataset = open_dataset(tmp_path / "d")
     assert dataset.resolution == n
-    config = TrainConfig(sizes, steps=12, batch=4, report_every=4)
+    config = TrainConfig(sizes, steps=30, batch=4, report_every=10)
     losses = [report.loss for report in train(tmp_path / "run", dataset, config)]
     assert losses[-1] < losses[0]
     prior = finished_prior(tmp_path / "run", dataset, config)
@@ -40,8 +40,8 @@ def test_a_network_of_another_resolution_trains_refines_and_meshes(tmp_path, enc
     seen = capture(mesh, views, noise=False, seed=0, resolution=n)
     merged = fusion.merge_all(measure_frames(seen))
     F, M = fusion.occupied(merged), fusion.occluded(merged)
-    search = RefineConfig(iterations=5, population=6)
-    run = reconstruct_jit(refiner_for("cma", prior, search), search)
+    search = RefineConfig(iterations=10)
+    run = reconstruct_jit(refiner_for("gradient:adam", prior, search), search)
     found = run(jax.random.key(0), prior, F[None], M[None])
     assert found.objective[0] < found.first_objective[0]
     rebuilt = surface(found.composed[0], seen.frame)
