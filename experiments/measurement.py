@@ -188,7 +188,7 @@ def rebuilder(prior: ShapePrior, iterations: int):
         }
 
         found = seen.evidence
-        soft = evidence.soft_grids(found)
+        soft = evidence.as_grids(found)
         F, M, _ = binary(soft)
         code = encode(prior, soft)
         first = decode(prior, code)

@@ -120,7 +120,7 @@ def _after(k: int, truth: trimesh.Trimesh, captured: Capture, prior: ShapePrior)
         T_object_camera=jax.tree.map(lambda x: x[:k], captured.T_object_camera),
     )
     field = jax.tree.map(lambda x: x[0], fuse(first, (k,)))
-    grids = jax.jit(lambda field: evidence.soft_grids(evidence.evidence(field)))(field)
+    grids = jax.jit(evidence.soft_grids)(field)
     F, M, _ = binary(grids)
     logits = propose(prior, grids)
     fused = fuse_surface(field, np.asarray(logits), captured.frame)

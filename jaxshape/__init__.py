@@ -16,8 +16,9 @@ Conventions, stated here once:
   (u, v) = (column + 0.5, row + 0.5).
 - Poses: `T_a_b` takes points of frame b to frame a, `p_a = T_a_b @ p_b`; `T_world_camera` is camera
   to world. `jaxlie.SE3` in JAX, 4x4 matrices in files.
-- Grids are indexed `[x, y, z]`, 32^3. Voxel i covers [i, i + 1) in voxel coordinates, its centre is
-  at i + 0.5; a `GridFrame` maps to the object frame, each axis with its own scale.
+- Grids are indexed `[x, y, z]`, 32^3 unless a prior was trained otherwise. Voxel i covers
+  [i, i + 1) in voxel coordinates, its centre is at i + 0.5; a `GridFrame` maps to the object frame,
+  each axis with its own scale.
 - Occupied voxels are those that hold a piece of the SURFACE; the inside of a solid is free.
 - A boolean array is named for what True means: `occupied` is F, `occluded` is M.
 - `decode` gives logits; a voxel is occupied where they are positive. Losses are in nats per voxel.
@@ -28,7 +29,7 @@ Conventions, stated here once:
 
 Data moves one way, and so do imports:
 
-    geometry   cameras, voxel frames, fusion of frames into F and M
+    geometry   cameras, voxel frames, fusion of frames into F and M or signed distances
     data       meshes, procedural chairs, virtual depth camera, training pairs, RGB-D recordings
     model      convolutions, auto-encoder, weights, training
     search     objective (Eq. 7), refiners, the batched search, composed shapes

@@ -1,6 +1,13 @@
 from .data.archives import MeshSource
 from .data.boxes import Box
-from .data.capture import Capture, capture, measure_frames
+from .data.capture import (
+    Capture,
+    camera_distance,
+    capture,
+    fuse_frames,
+    measure_frames,
+    sensor_of,
+)
 from .data.chairs import random_chair
 from .data.meshes import Model, Skipped, load, read_meshes
 from .data.sequences import (
@@ -12,10 +19,13 @@ from .data.sequences import (
 )
 from .data.virtual_cameras import SensorNoise, VirtualCamera, virtual_camera
 from .geometry.camera import Intrinsics, orbit, random_views
+from .geometry.distance import DistanceField
+from .geometry.evidence import soft_grids
 from .geometry.fusion import Measurement, measure, merge, merge_all, occluded, occupied
 from .geometry.grid import GridFrame, fit_box, fit_box_isotropic
 from .geometry.grids import Grids, binary
 from .geometry.overlap import iou
+from .geometry.pixels import Sensor
 from .mapping.config import MappingConfig, TrackingConfig
 from .mapping.map.mapper import Mapper, build_mapper
 from .mapping.map.recording import Progress, follow, trajectory
@@ -27,6 +37,7 @@ from .model.config import Architecture
 from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
 from .model.weights import load_prior, save_prior
 from .report.page import write_report
+from .results.fused_surface import FusedSurface, fuse_surface
 from .results.metrics import Bounds, ShapeScores, bounds, chamfer_l1, f_score, shape_scores
 from .results.surface import surface, write_mesh
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
@@ -80,7 +91,9 @@ __all__ = [
     "Candidate",
     "Capture",
     "CmaState",
+    "DistanceField",
     "Distribution",
+    "FusedSurface",
     "GridFrame",
     "Grids",
     "Intrinsics",
@@ -105,6 +118,7 @@ __all__ = [
     "Residual",
     "SOFT",
     "Segmentation",
+    "Sensor",
     "SensorNoise",
     "ShapeModel",
     "ShapePrior",
@@ -123,6 +137,7 @@ __all__ = [
     "bounds",
     "build_mapper",
     "build_refiner",
+    "camera_distance",
     "capture",
     "chamfer_l1",
     "cma",
@@ -143,6 +158,8 @@ __all__ = [
     "fit_box_isotropic",
     "fit_surface",
     "follow",
+    "fuse_frames",
+    "fuse_surface",
     "gradient",
     "iou",
     "keep_better",
@@ -169,8 +186,10 @@ __all__ = [
     "refiner_for",
     "save_prior",
     "segment",
+    "sensor_of",
     "shape_scores",
     "soft",
+    "soft_grids",
     "start_trace",
     "summarise",
     "surface",

@@ -88,7 +88,15 @@ def capture(
 
 
 def camera_distance(mesh: trimesh.Trimesh, camera: VirtualCamera = PAPER) -> float:
-    """Distance of a virtual camera from the object's centre, in metres."""
+    """Distance at which a virtual camera stands from the object's centre, in metres.
+
+    Args:
+        mesh: The object, in metres.
+        camera: The camera; the paper's by default.
+
+    Returns:
+        Metres.
+    """
     return camera.distance * float(mesh.scale)
 
 
@@ -124,7 +132,11 @@ def measure_frames(captured: Capture) -> Measurement:
 
 
 def sensor_of(camera: VirtualCamera) -> Sensor:
-    """How well a camera measures depth: its noise, and the steps in which depths come."""
+    """How well a camera measures depth: its noise, and the steps in which depths come.
+
+    Args:
+        camera: The camera whose frames are fused.
+    """
     step = camera.noise.quantization / math.sqrt(12)  # the deviation of a uniform distribution
     return Sensor(axial=math.hypot(camera.noise.axial, step))
 
@@ -136,6 +148,14 @@ def fuse_frames(
 
     Frames are added one at a time, so that one field at a time is in memory, besides those asked
     for; every pixel that hit something shows the object.
+
+    Args:
+        captured: Depth frames of an object, from `capture`.
+        frames: Increasing numbers of frames, 1 or more each.
+        sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
+
+    Returns:
+        One field for each number of frames `[len(frames) n n n]`.
     """
 
     def add(field: DistanceField, frame: tuple[Array, jaxlie.SE3]) -> tuple[DistanceField, None]:

@@ -63,24 +63,14 @@ class VirtualCamera:
     noise: SensorNoise = field(default_factory=SensorNoise)
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1:
-            raise ValueError(
-                f"A camera of {self.width} x {self.height} pixels sees nothing; give 1 or more."
-            )
-        if self.field_of_view is not None and not 0 < self.field_of_view < 180:
-            raise ValueError(
-                f"field_of_view must lie between 0 and 180 degrees, but is {self.field_of_view}."
-            )
+        checks.whole("width", self.width, 1)
+        checks.whole("height", self.height, 1)
         if self.field_of_view is None and self.width != self.height:
-            raise ValueError(
-                f"Only square images have a lens fitted, but {self.width} x {self.height} pixels "
-                "were given; give a field of view, or as many rows as columns."
-            )
+            checks.refuse("field_of_view", None, "degrees, or as many rows as columns")
+        if self.field_of_view is not None and not 0 < self.field_of_view < 180:
+            checks.refuse("field_of_view", self.field_of_view, "degrees above 0 and below 180")
         if not self.distance > 0.5:
-            raise ValueError(
-                "A camera must stand outside the object, more than 0.5 diagonals from its centre, "
-                f"but distance is {self.distance}."
-            )
+            checks.refuse("distance", self.distance, "more than 0.5 diagonals, outside the object")
 
 
 CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]

@@ -91,17 +91,24 @@ def _within_margin(count: Float[Array, "*batch x y z"]) -> Float[Array, "*batch 
     return count
 
 
-def soft_grids(evidence: Evidence) -> Grids:
-    """F and M as probabilities; rounded (`binary`) they are the measurement grid and the mask.
-
-    Args:
-        evidence: What the frames say about each voxel.
-
-    Returns:
-        M is the probability of unknown voxels, F that of surface among the known ones.
-    """
+def as_grids(evidence: Evidence) -> Grids:
+    """F and M as probabilities: that of surface among the known voxels, and of unknown ones."""
     known = evidence.surface + evidence.free
     return Grids(evidence.surface / jnp.where(known > 0, known, 1), 1 - known)
+
+
+def soft_grids(field: DistanceField, resolution: int = RESOLUTION) -> Grids:
+    """F and M as probabilities, from fused signed distances.
+
+    Args:
+        field: Signed distances `[*batch n n n]` of a fine grid whose side n is a multiple of the
+            resolution.
+        resolution: Voxels along each axis of the grids.
+
+    Returns:
+        Soft grids; rounded (`binary`) they are the measurement grid and the occlusion mask.
+    """
+    return as_grids(evidence(field, resolution))
 
 
 def _pad(x: Bool[Array, "*batch x y z"], axis: int, width: tuple[int, int]) -> Array:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, UInt32
 
+from jaxshape import checks
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.sensor import DEVIATION
 
@@ -24,14 +25,17 @@ class Sensor:
     Attributes:
         axial: Standard deviation of depth, in metres at 1 m; grows with the square of depth.
         floor: Errors that do not grow with depth, in metres: of calibration and of poses.
+
+    Raises:
+        ValueError: A deviation is negative.
     """
 
     axial: float = DEVIATION
     floor: float = 3e-3
 
     def __post_init__(self) -> None:
-        if not self.axial >= 0:
-            raise ValueError(f"axial must be 0 m or more, but is {self.axial}.")
+        checks.at_least("axial", self.axial, 0)
+        checks.at_least("floor", self.floor, 0)
 
 
 class SurfacePixels(NamedTuple):

@@ -113,10 +113,10 @@ def test_a_sensor_is_as_exact_as_the_camera_it_belongs_to():
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ((0, 10, None), "0 x 10 pixels"),
-        ((20, 10, None), "square"),
-        ((20, 10, 200.0), "field_of_view"),
-        ((20, 20, None, 0.4), "outside"),
+        ((0, 10, None), "width is 0"),
+        ((20, 10, None), "field_of_view is None; give degrees, or as many rows"),
+        ((20, 10, 200.0), "field_of_view is 200.0"),
+        ((20, 20, None, 0.4), "distance is 0.4"),
     ],
 )
 def test_impossible_cameras_are_refused(wrong, said):

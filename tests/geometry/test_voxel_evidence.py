@@ -13,7 +13,7 @@ find = jax.jit(evidence.evidence)
 
 
 def occupied(found):
-    return binary(evidence.soft_grids(found)).occupied
+    return binary(evidence.as_grids(found)).occupied
 
 
 def wall(at, *, weight=0.5, free=0.0):
@@ -28,13 +28,13 @@ def wall(at, *, weight=0.5, free=0.0):
 def test_nothing_measured_is_unknown():
     found = find(distance.nothing_measured(N))
     assert (found.surface == 0).all() and (found.free == 0).all()
-    F, M, _ = binary(evidence.soft_grids(found))
+    F, M, _ = binary(evidence.as_grids(found))
     assert M.all() and not F.any()
 
 
 def test_a_wall_is_surface_where_it_stands_free_before_it_and_unknown_behind():
     found = find(wall(66.2))
-    F, M, _ = binary(evidence.soft_grids(found))
+    F, M, _ = binary(evidence.as_grids(found))
     np.testing.assert_array_equal(F[16, 1:-1, 1:-1], True)  # fine voxels 64 to 67
     np.testing.assert_array_equal(np.asarray(F).any(axis=(1, 2)).sum(), 1)
     assert not M[17:].any() and (found.free[18:] == 1).all()
@@ -91,5 +91,5 @@ def test_evidence_broadcasts_over_objects():
 
 def test_thresholds_split_all_voxels():
     found = Evidence(jnp.linspace(0, 1, 32**3).reshape(32, 32, 32), jnp.zeros((32, 32, 32)))
-    F, M, _ = binary(evidence.soft_grids(found))
+    F, M, _ = binary(evidence.as_grids(found))
     np.testing.assert_array_equal(F ^ M, True)
