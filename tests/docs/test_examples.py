@@ -65,10 +65,14 @@ def test_the_decoder_fits_chairs_that_it_never_saw(answer):
     assert 0 < first < last - 0.03
 
 
+def quick(weights: Path) -> dict[str, str]:
+    """Weights that compile at once, in place of the package's."""
+    return {"js.load_prior()": f"js.load_prior({str(weights)!r})"}
+
+
 def test_outlines_reach_the_search(answer, linear_weights):
     """With a prior that compiles at once, and knows no chairs: the shapes differ."""
-    quick = {"js.load_prior()": f"js.load_prior({str(linear_weights)!r})", ":.2f": ":.5f"}
-    alone, outlined = answer("own_residual.py", quick)
+    alone, outlined = answer("own_residual.py", quick(linear_weights) | {":.2f": ":.5f"})
     assert alone != outlined
 
 
@@ -78,6 +82,13 @@ def test_outlines_make_shapes_better(answer):
     assert outlined > alone
 
 
+def test_a_search_of_ones_own_searches(answer, linear_weights):
+    """With a prior that compiles at once, and knows no chairs."""
+    own_objective, _, adam_objective, _ = answer("own_search.py", quick(linear_weights))
+    assert 0 < own_objective < 3 * adam_objective
+
+
+@pytest.mark.slow
 def test_the_search_goes_as_low_as_adam_does(answer):
     own_objective, own_iou, adam_objective, _ = answer("own_search.py")
     assert own_objective < 1.1 * adam_objective and own_iou > 0.5

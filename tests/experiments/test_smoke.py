@@ -7,19 +7,13 @@ from dataclasses import replace
 import pytest
 from PIL import Image
 
-SCRIPTS = [
-    "convergence",
-    "step_size",
-    "iou_by_frames",
-    "voluminous",
-    "gallery",
-    "gradient_failures",
-    "equal_budget",
-    "objective",
-]
+SCRIPTS = ["convergence", "iou_by_frames", "objective"]
+LONG = ["step_size", "voluminous", "gallery", "gradient_failures", "equal_budget"]
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize(
+    "name", [*SCRIPTS, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
+)
 def test_smoke(name, linear_weights, tmp_path):
     script = importlib.import_module(name)
     config = replace(script.Config(), weights=linear_weights, smoke=True, results=tmp_path)
