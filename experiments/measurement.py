@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from jaxshape.data.archives import list_meshes
 from jaxshape.data.capture import (
     Capture,
     camera_distance,
@@ -32,7 +31,7 @@ from jaxshape.data.capture import (
     measure_frames,
     sensor_of,
 )
-from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
+from jaxshape.data.dataset import Object, hash_seed, load_object
 from jaxshape.data.meshes import Model
 from jaxshape.data.virtual_cameras import CAMERAS, CameraName
 from jaxshape.geometry import camera, evidence, fusion
@@ -48,7 +47,7 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import compose, refiner_for, search_space
 from jaxshape.search.residuals import BALANCED, SOFT, Target
 from jaxshape.search.run import refine
-from study import Claim, conclude
+from study import Claim, conclude, listed, name_of
 
 RESULTS = Path(__file__).parent / "results"
 SEATS_AT_A_TIME = 4
@@ -109,7 +108,8 @@ def run(config: Config) -> Journal:
         "weights": fingerprint(prior),
     }
     journal = Journal(config.results / f"{config.name}.json", settings)
-    chairs = [chair for chair in subjects(config) if name_of(chair) not in journal.rows]
+    chairs = listed(config.meshes, config.chairs)[: config.chairs]
+    chairs = [chair for chair in chairs if name_of(chair) not in journal.rows]
     rebuild = rebuilder(prior, config.iterations)
     for start in range(0, len(chairs), SEATS_AT_A_TIME):
         began, some = time.perf_counter(), chairs[start : start + SEATS_AT_A_TIME]
@@ -124,17 +124,6 @@ def run(config: Config) -> Journal:
         print(f"{len(journal.rows)} of {config.chairs}", flush=True)
     conclude(journal, claims(journal, config), means=means(journal))
     return journal
-
-
-def subjects(config: Config) -> list[Object]:
-    """The chairs to measure."""
-    if config.meshes is None:
-        return list(range(TEST_SEEDS, TEST_SEEDS + config.chairs))
-    return list_meshes(config.meshes)[: config.chairs]
-
-
-def name_of(chair: Object) -> str:
-    return str(chair) if isinstance(chair, int) else chair.name
 
 
 def observe(chair: Object, config: Config) -> Seen:

@@ -79,6 +79,18 @@ def subjects(test: TestSet) -> list[Subject]:
     return sorted(procedural + cad[: test.seats], key=_mix)
 
 
+def listed(meshes: Path | None, count: int) -> list[Object]:
+    """All meshes of a folder, in its order; as many procedural chairs where none is given."""
+    if meshes is None:
+        return list(range(TEST_SEEDS, TEST_SEEDS + count))
+    return [*list_meshes(meshes)]
+
+
+def name_of(chair: Object) -> str:
+    """The name of a chair in results files."""
+    return str(chair) if isinstance(chair, int) else chair.name
+
+
 def _mix(subject: Any) -> int:
     return hash_seed(0, *subject.name.encode())
 

@@ -29,9 +29,8 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from jaxshape.data import render
-from jaxshape.data.archives import list_meshes
 from jaxshape.data.capture import Capture, camera_distance, capture, fuse_frames
-from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
+from jaxshape.data.dataset import Object, hash_seed, load_object
 from jaxshape.data.meshes import Model
 from jaxshape.data.virtual_cameras import CAMERAS
 from jaxshape.geometry import camera, evidence
@@ -44,7 +43,7 @@ from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.surface import surface
 from jaxshape.search.reconstruction import compose
-from study import Claim, conclude
+from study import Claim, conclude, listed, name_of
 
 RESULTS = Path(__file__).parent / "results"
 DEVICE = CAMERAS["kinect"]
@@ -89,19 +88,13 @@ def run(config: Config) -> Journal:
         "open3d": importlib.util.find_spec("open3d") is not None,
     }
     journal = Journal(config.results / "surface_accuracy.json", settings)
-    for chair in subjects(config):
-        name = str(chair) if isinstance(chair, int) else chair.name
+    for chair in listed(config.meshes, 78)[:: config.every]:
+        name = name_of(chair)
         if name not in journal.rows:
             began = time.perf_counter()
             journal.add({name: row(chair, prior, config)}, time.perf_counter() - began)
     conclude(journal, claims(journal), means=means(journal))
     return journal
-
-
-def subjects(config: Config) -> list[Object]:
-    if config.meshes is None:
-        return [TEST_SEEDS + i for i in range(78)][:: config.every]
-    return [*list_meshes(config.meshes)][:: config.every]
 
 
 def row(chair: Object, prior: ShapePrior, config: Config) -> dict[str, Any]:

@@ -113,7 +113,12 @@ def pack(grids: Bool[np.ndarray, "*batch x y z"]) -> UInt8[np.ndarray, "*batch b
 def unpack(packed: UInt8[np.ndarray, "*batch bytes"]) -> Bool[np.ndarray, "*batch x y z"]:
     """The grids that were packed."""
     grids = np.unpackbits(packed, axis=-1).astype(bool)
-    return grids.reshape(*packed.shape[:-1], *[round(grids.shape[-1] ** (1 / 3))] * 3)
+    return grids.reshape(*packed.shape[:-1], *[_side(packed)] * 3)
+
+
+def _side(packed: UInt8[np.ndarray, "*batch bytes"]) -> int:
+    """Voxels along each axis of the grids that were packed."""
+    return round((8 * packed.shape[-1]) ** (1 / 3))
 
 
 # ------------------------------------------------------------------ writing
@@ -239,7 +244,7 @@ class Dataset(NamedTuple):
     @property
     def resolution(self) -> int:
         """Voxels along each axis of the grids."""
-        return round((8 * self.shards[0].shape[2]) ** (1 / 3))
+        return _side(self.shards[0])
 
     def packed(self, index: int) -> UInt8[np.ndarray, "view bytes"]:
         """The packed surface of one object, followed by its views."""

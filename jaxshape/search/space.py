@@ -26,7 +26,7 @@ class LatentSpace(NamedTuple):
             for no box.
     """
 
-    mean: Float[Array, "*d"]
+    mean: Float[Array, " d"]
     root: Float[Array, "d d"] | None
     bound: Float[Array, ""] | float | None = None
 
