@@ -1,0 +1,167 @@
+"""The two ways in which frames become F and M, behind one interface.
+
+`Points` counts measured points in voxels, as in the paper (Eq. 6); `Distances` averages signed
+distances on a fine grid, for depth that is real or noisy. Both are static under `jax.jit`:
+
+    state = fusing.nothing(resolution)
+    state = fusing.merge(state, fusing.measure(depth, segmented, intrinsics, T, frame, sensor))
+    grids = fusing.grids(state)
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from jaxshape import checks
+from jaxshape.geometry import distance, fusion
+from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.distance import DistanceField
+from jaxshape.geometry.evidence import soft_grids
+from jaxshape.geometry.fusion import Measurement
+from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.geometry.grids import Grids
+from jaxshape.geometry.pixels import Sensor
+
+FusionName = Literal["distance", "points"]
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Points:
+    """Points counted in voxels: binary F and M (paper, Eq. 6).
+
+    Attributes:
+        resolution: Voxels along each axis of F and M.
+        min_hits: Points that make a voxel occupied, 1 or more (paper: 1).
+
+    Raises:
+        ValueError: A setting is outside its range.
+    """
+
+    resolution: int = RESOLUTION
+    min_hits: int = 1
+
+    def __post_init__(self) -> None:
+        checks.whole("resolution", self.resolution, 1)
+        checks.whole("min_hits", self.min_hits, 1)
+
+    def nothing(self) -> Measurement:
+        """The measurement of no frames."""
+        return fusion.nothing_measured(self.resolution)
+
+    def measure(
+        self, depth, segmented, intrinsics, T_object_camera, frame, sensor: Sensor = Sensor()
+    ) -> Measurement:
+        """The measurement of one frame; points have no weights, so the sensor does not count."""
+        del sensor
+        return fusion.measure(depth, segmented, intrinsics, T_object_camera, frame, self.resolution)
+
+    def merge(self, first: Measurement, second: Measurement) -> Measurement:
+        """The measurement of both sets of frames."""
+        return fusion.merge(first, second)
+
+    def grids(self, state: Measurement) -> Grids:
+        """F and M."""
+        occupied = fusion.occupied(state, self.min_hits)
+        return Grids(occupied, fusion.occluded(state, self.min_hits))
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Distances:
+    """Signed distances averaged on a fine grid: soft F and M.
+
+    Attributes:
+        resolution: Voxels along each axis of F and M.
+        fine: Voxels along each axis of the fine grid, a multiple of the resolution; None for 4
+            times 32 (or the resolution, where that is more).
+
+    Raises:
+        ValueError: The fine grid is not a multiple of the other.
+    """
+
+    resolution: int = RESOLUTION
+    fine: int | None = None
+
+    def __post_init__(self) -> None:
+        checks.whole("resolution", self.resolution, 1)
+        if self._side % self.resolution:
+            checks.refuse("fine", self.fine, f"a multiple of {self.resolution}")
+
+    @property
+    def _side(self) -> int:
+        return self.fine or max(self.resolution, distance.FINE * RESOLUTION)
+
+    def nothing(self) -> DistanceField:
+        """The field of no frames."""
+        return distance.nothing_measured(self._side)
+
+    def measure(
+        self, depth, segmented, intrinsics, T_object_camera, frame, sensor: Sensor = Sensor()
+    ) -> DistanceField:
+        """The field of one frame."""
+        coarse = frame._replace(voxel_size=frame.voxel_size * (self.resolution / RESOLUTION))
+        return distance.measure(
+            depth, segmented, intrinsics, T_object_camera, coarse, sensor, self._side
+        )
+
+    def merge(self, first: DistanceField, second: DistanceField) -> DistanceField:
+        """The field of both sets of frames."""
+        return distance.merge(first, second)
+
+    def grids(self, state: DistanceField) -> Grids:
+        """Soft F and M."""
+        return soft_grids(state, self.resolution)
+
+
+Fusion = Points | Distances
+"""A way to fuse frames; merging is associative and commutative, with `nothing()` as identity."""
+
+
+def fusion_named(name: FusionName, resolution: int = RESOLUTION, min_hits: int = 1) -> Fusion:
+    """A way to fuse frames by name.
+
+    Args:
+        name: "distance" for signed distances, "points" for the paper's points.
+        resolution: Voxels along each axis of F and M.
+        min_hits: Points that make a voxel occupied, for "points".
+
+    Raises:
+        ValueError: There is none of that name, or a number is outside its range.
+    """
+    checks.one_of("fusion", name, ("distance", "points"))
+    return Points(resolution, min_hits) if name == "points" else Distances(resolution)
+
+
+def fuse(
+    fusing: Fusion,
+    depth: Float[Array, "frame h w"],
+    segmented: Bool[Array, "frame h w"],
+    intrinsics: Intrinsics,
+    T_object_camera: jaxlie.SE3,
+    frame: GridFrame,
+    sensor: Sensor = Sensor(),
+) -> Any:
+    """The state of all frames of one camera, added one at a time so that memory holds two fields.
+
+    Args:
+        fusing: The way to fuse them.
+        depth: Metres `[frame h w]`; 0 where nothing is known, infinite where the ray met nothing.
+        segmented: True on pixels that show the object `[frame h w]`.
+        intrinsics: The camera of all frames.
+        T_object_camera: Pose of each frame in the object frame `[frame]`.
+        frame: Voxel frame of F and M.
+        sensor: How the camera's noise grows.
+    """
+
+    merge: Any = fusing.merge  # of either kind, and so is the state
+
+    def add(state, one):
+        depth, segmented, T = one
+        new = fusing.measure(depth, segmented, intrinsics, T, frame, sensor)
+        return merge(state, new), None
+
+    return jax.lax.scan(add, fusing.nothing(), (depth, segmented, T_object_camera))[0]
