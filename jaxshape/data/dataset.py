@@ -1,10 +1,11 @@
-"""Training pairs on disk: partial views and complete surfaces of many objects. [host]
+"""Training pairs on disk: what was measured of many objects, and their complete surfaces. [host]
 
-A dataset is a folder of shards. A shard holds up to `OBJECTS_PER_SHARD` objects in one `.npy` of
-bit-packed grids, `[object, 1 + view, bytes]`, where entry 0 is the complete surface **Y** and
-the others are the measurements **F** of one frame each; a `.json` beside it names its objects and
-what was skipped. Shards are written whole or not at all, so a killed build goes on where it
-stopped, and a finished one has nothing left to do.
+A dataset is a folder of shards of up to `OBJECTS_PER_SHARD` objects. Of each object a shard holds
+the complete surface **Y** along each camera path, in bit-packed grids `[object path bytes]`, and
+what was measured after each number of frames, `[object path number voxels]`: one byte for each
+voxel, of which 4 bits are the probability of surface and 4 that of free space, in fifteenths. A
+`.json` beside it names the objects and what was skipped; it comes last, so that a killed build goes
+on where it stopped, and a finished one has nothing left to do.
 """
 
 import hashlib
@@ -16,23 +17,31 @@ from dataclasses import asdict
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 import trimesh
-from jaxtyping import Array, Bool, UInt8
+from jaxtyping import Bool, UInt8
 
 from jaxshape.data import meshes
 from jaxshape.data.archives import MeshSource
-from jaxshape.data.capture import Capture, camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.config import DatasetConfig
 from jaxshape.data.meshes import Model, Skipped
+from jaxshape.data.paths import draw_path
 from jaxshape.files import atomic_path, write_json
-from jaxshape.geometry import camera, fusion
+from jaxshape.geometry.grids import Grids
+
+FORMAT = "jaxshape-dataset-2"
+
+KINDS = ("surface", "measured")
+"""Arrays of a shard, each in a file of its own."""
 
 OBJECTS_PER_SHARD = 64
+
+STEPS = 15
+"""Steps of the probabilities of what was measured, which have 4 bits each."""
 
 TEST_SEEDS = 1_000_000
 """Procedural chairs from this seed on are for tests; training uses smaller ones."""
@@ -69,40 +78,31 @@ def load_object(item: Object, *, up: str = "y", front: str = "z") -> Model | Ski
     return Model(f"chair-{item}", random_chair(item), {})
 
 
-def training_grids(
+def object_paths(
     mesh: trimesh.Trimesh, config: DatasetConfig, seed: int
-) -> UInt8[np.ndarray, "n bytes"]:
-    """The complete surface of one object and its views, packed."""
-    key = jax.random.key(seed)
-    T_object_camera = camera.random_views(key, config.views, camera_distance(mesh))
-    captured = capture(
-        mesh,
-        T_object_camera,
-        noise=_draws_noise(config, seed),
-        seed=seed,
-        resolution=config.resolution,
-    )
-    views = _occupied_by_frame(captured)
-    return pack(np.concatenate([np.asarray(captured.surface)[None], np.asarray(views)]))
+) -> tuple[UInt8[np.ndarray, "path bytes"], UInt8[np.ndarray, "path number voxels"]]:
+    """The complete surface of one object and what was measured of it along each path, packed."""
+    paths = [draw_path(mesh, config, hash_seed(seed, i)) for i in range(config.paths)]
+    surfaces = np.stack([np.asarray(path.surface) for path in paths])
+    measured = np.stack([pack_measured(jax.device_get(path.measured)) for path in paths])
+    return pack(surfaces), measured
 
 
-def is_noisy(index: int, config: DatasetConfig) -> bool:
-    """Whether the depth images of an object, by its place among all, have a sensor's faults."""
-    return _draws_noise(config, _object_seed(config, index))
+def pack_measured(grids: Grids) -> UInt8[np.ndarray, "*batch voxels"]:
+    """Binary or soft F and M with two probabilities in each byte, in fifteenths."""
+    F, M = (np.asarray(x, np.float32) for x in grids[:2])
+    surface = np.rint(STEPS * F * (1 - M)).astype(np.uint8)
+    free = np.minimum(np.rint(STEPS * (1 - F) * (1 - M)), STEPS - surface).astype(np.uint8)
+    return (16 * surface + free).reshape(*F.shape[:-3], -1)
 
 
-def _object_seed(config: DatasetConfig, index: int) -> int:
-    return hash_seed(config.seed, index)
-
-
-def _draws_noise(config: DatasetConfig, seed: int) -> bool:
-    return bool(np.random.default_rng(seed).random() < config.noisy)
-
-
-@jax.jit
-def _occupied_by_frame(captured: Capture) -> Bool[Array, "views x y z"]:
-    """The measurement **F** of each frame alone; jit leaves out what it does not need."""
-    return fusion.occupied(measure_frames(captured))
+def unpack_measured(packed: UInt8[np.ndarray, "*batch voxels"]) -> Grids:
+    """The soft F and M `[*batch x y z]`, float32, that were packed."""
+    surface, free = packed // 16, packed % 16
+    known = surface + free
+    side = round(packed.shape[-1] ** (1 / 3))
+    F, M = np.float32(surface / np.maximum(known, 1)), np.float32(1 - known / STEPS)
+    return Grids(*(x.reshape(*packed.shape[:-1], side, side, side) for x in (F, M)))
 
 
 def pack(grids: Bool[np.ndarray, "*batch x y z"]) -> UInt8[np.ndarray, "*batch bytes"]:
@@ -168,18 +168,21 @@ def build_dataset(
 def _write_shard(
     folder: Path, config: DatasetConfig, number: int, items: Sequence[Object]
 ) -> list[Skipped]:
-    names, grids, skipped = [], [], []
+    names, made, skipped = [], [], []
     for i, item in enumerate(items):
         model = load_object(item, up=config.up, front=config.front)
         if isinstance(model, Skipped):
             skipped.append(model)
             continue
-        seed = _object_seed(config, number * OBJECTS_PER_SHARD + i)
+        seed = hash_seed(config.seed, number * OBJECTS_PER_SHARD + i)
         names.append(model.name)
-        grids.append(training_grids(model.mesh, config, seed))
-    shape = (0, 1 + config.views, config.resolution**3 // 8)
-    with atomic_path(_shard_path(folder, number, "npy")) as path:
-        np.save(path, np.stack(grids) if grids else np.zeros(shape, np.uint8))
+        made.append(object_paths(model.mesh, config, seed))
+    voxels = config.resolution**3
+    shapes = (config.paths, voxels // 8), (config.paths, len(config.frames), voxels)
+    for kind, shape, arrays in zip(KINDS, shapes, zip(*made, strict=True) if made else ((), ()),
+                                   strict=True):  # fmt: skip
+        with atomic_path(_shard_path(folder, number, f"{kind}.npy")) as path:
+            np.save(path, np.stack(arrays) if arrays else np.zeros((0, *shape), np.uint8))
     # The names come last: a shard counts as written once they are there.
     write_json(_shard_path(folder, number, "json"), {"names": names, "skipped": skipped})
     return skipped
@@ -193,21 +196,17 @@ def hash_seed(*numbers: int) -> int:
 def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> None:
     names = [item.name if isinstance(item, MeshSource) else str(item) for item in objects]
     digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
-    claim = {"config": asdict(config), "objects": len(names), "names_sha256": digest}
+    settings = json.loads(json.dumps(asdict(config)))
+    claim = {"format": FORMAT, "config": settings, "objects": len(names), "names_sha256": digest}
     path = folder / "dataset.json"
     if path.exists():
-        if _of_today(json.loads(path.read_text())) != claim:
+        if json.loads(path.read_text()) != claim:
             raise DatasetError(
                 f"{str(folder)!r} already holds a dataset of other objects or settings; "
                 "give another folder, or remove this one."
             )
         return
     write_json(path, claim)
-
-
-def _of_today(claim: dict[str, Any]) -> dict[str, Any]:
-    """The claim of a folder, with the defaults of settings that came after it was made."""
-    return claim | {"config": asdict(DatasetConfig()) | claim.get("config", {})}
 
 
 def _shard_path(folder: Path, number: int, suffix: str) -> Path:
@@ -227,36 +226,41 @@ class Dataset(NamedTuple):
 
     Attributes:
         names: Names of the objects.
-        shards: Memory-mapped shards `[object view bytes]`; entry 0 of the second axis is the
-            complete surface.
+        surfaces: Memory-mapped complete surfaces of each shard `[object path bytes]`, packed.
+        measured: Memory-mapped measurements of each shard `[object path number voxels]`, packed.
         row: Shard, and place in it, of each object.
     """
 
     names: list[str]
-    shards: list[UInt8[np.ndarray, "object view bytes"]]
+    surfaces: list[UInt8[np.ndarray, "object path bytes"]]
+    measured: list[UInt8[np.ndarray, "object path number voxels"]]
     row: list[tuple[int, int]]
-
-    @property
-    def views(self) -> int:
-        """Views of each object."""
-        return self.shards[0].shape[1] - 1
 
     @property
     def resolution(self) -> int:
         """Voxels along each axis of the grids."""
-        return _side(self.shards[0])
+        return _side(self.surfaces[0])
 
-    def packed(self, index: int) -> UInt8[np.ndarray, "view bytes"]:
-        """The packed surface of one object, followed by its views."""
+    def surface(self, index: int, path: int = 0) -> Bool[np.ndarray, "x y z"]:
+        """The complete surface of an object along one of its paths."""
         shard, place = self.row[index]
-        return self.shards[shard][place]
+        return unpack(self.surfaces[shard][place, path])
+
+    def inputs_of(self, index: int) -> tuple[int, int]:
+        """How many paths an object has, and how many measurements each."""
+        return self.measured[self.row[index][0]].shape[1:3]
+
+    def grids(self, index: int, path: int, number: int) -> Grids:
+        """Soft F and M of an object after one of the numbers of frames of one of its paths."""
+        shard, place = self.row[index]
+        return unpack_measured(self.measured[shard][place, path, number])
 
 
 def surfaces(dataset: Dataset, limit: int = 4096) -> Bool[np.ndarray, "n x y z"]:
     """The complete surfaces of a dataset, at most `limit` of them, evenly chosen."""
     count = len(dataset.names)
     chosen = np.unique(np.linspace(0, count - 1, min(count, limit)).astype(int))
-    return unpack(np.stack([dataset.packed(i)[0] for i in chosen]))
+    return np.stack([dataset.surface(i) for i in chosen])
 
 
 def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
@@ -271,7 +275,13 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     folder = Path(folder)
     if not (folder / "dataset.json").exists():
         raise DatasetError(f"There is no dataset in {str(folder)!r}; make one: jaxshape dataset.")
-    count = json.loads((folder / "dataset.json").read_text())["objects"]
+    claim = json.loads((folder / "dataset.json").read_text())
+    if claim.get("format") != FORMAT:
+        raise DatasetError(
+            f"{str(folder)!r} holds a dataset of an earlier version of jaxshape; build it again: "
+            "jaxshape dataset."
+        )
+    count = claim["objects"]
     expected = -(-count // OBJECTS_PER_SHARD)
     missing = [n for n in range(expected) if not _shard_path(folder, n, "json").exists()]
     if missing:
@@ -279,12 +289,15 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
             f"{len(missing)} of the {expected} shards of {str(folder)!r} are missing; "
             "run the same `jaxshape dataset` command again to finish it."
         )
-    names, shards, row = [], [], []
+    names, row = [], []
+    arrays: dict[str, list[np.ndarray]] = {kind: [] for kind in KINDS}
     for number in range(expected):
         inside = _read_names(folder, number)[0]
         names += inside
         row += [(number, place) for place in range(len(inside))]
-        shards.append(np.load(_shard_path(folder, number, "npy"), mmap_mode="r"))
+        for kind in KINDS:
+            path = _shard_path(folder, number, f"{kind}.npy")
+            arrays[kind].append(np.load(path, mmap_mode="r"))
     if not names:
         raise DatasetError(f"Every object of the dataset in {str(folder)!r} was skipped.")
-    return Dataset(names, shards, row)
+    return Dataset(names, arrays["surface"], arrays["measured"], row)
