@@ -1,9 +1,9 @@
-"""Sizes of the auto-encoder and settings of its training.
+"""Sizes of networks and settings of their training.
 
 Nothing here imports JAX, so that the command line answers at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from jaxshape import checks
@@ -55,13 +55,42 @@ class Architecture:
 
 
 @dataclass(frozen=True)
+class Completion:
+    """Sizes of the network that is conditioned on what was measured (`model/completion`).
+
+    Attributes:
+        channels: Channels at a half, a quarter and an eighth of the resolution, each 1 or more.
+        depth: Blocks at a quarter and an eighth of the resolution on the way down, 1 or more.
+        code: Numbers in a code, 2 or more.
+        resolution: Voxels along each axis of the grids, a multiple of 8.
+
+    Raises:
+        ValueError: A size is outside its range.
+    """
+
+    channels: tuple[int, int, int] = (32, 96, 128)
+    depth: int = 2
+    code: int = 100
+    resolution: int = 32
+
+    def __post_init__(self) -> None:
+        if min(self.channels) < 1:
+            checks.refuse("channels", self.channels, "numbers of channels, 1 or more each")
+        checks.whole("depth", self.depth, 1)
+        checks.whole("code", self.code, 2)
+        if self.resolution < 8 or self.resolution % 8:
+            checks.refuse("resolution", self.resolution, "a multiple of 8")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Settings of a training run, besides its dataset and the weights it starts from.
 
     The defaults are the preset `default`.
 
     Attributes:
-        architecture: Sizes of the network.
+        architecture: Sizes of the network, and with them its kind: the conditional network, or the
+            paper's auto-encoder.
         inputs: How pairs are drawn from the dataset.
         steps: Batches in all, 1 or more.
         batch: Pairs in a batch, over all devices, 1 or more.
@@ -70,14 +99,19 @@ class TrainConfig:
         learning_rate: Peak of the optimiser's step size, above 0 (paper: 1e-4, of Adam).
         schedule: Whether the step size warms up and decays to zero along a cosine, or stays
             constant (paper).
+        average: Decay of the running average of the parameters, 0 to below 1, which the finished
+            weights are; 0 for the parameters of the last step.
         occupied_weight: Weight of occupied voxels in the loss, above 0 (paper: 1). At 1.5 a voxel
             counts as occupied from a probability of 0.4 on, where the IoU of shapes as uncertain as
             these is better than at 0.5.
-        code_noise: Standard deviation of noise added to the codes, 0 or more.
-        code_weight: Weight of half the squared length of a code, in nats, in the loss of its grid,
-            0 or more: with noise of 1, the KL divergence of a variational auto-encoder whose
-            posterior has variance 1.
+        occluded_weight: Weight of occluded voxels in the loss, above 0 (paper: 1).
+        code_noise: Standard deviation of noise added to the codes of an auto-encoder, 0 or more.
+        code_weight: Weight of what a code costs, 0 or more: of the KL divergence of the conditional
+            network's codes, and of half the squared length, in nats, of an auto-encoder's, which
+            with noise of 1 is the divergence of a posterior of variance 1.
         bfloat16: Compute convolutions in bfloat16; parameters, statistics and Adam stay in float32.
+        validation: Objects at the end of the dataset that are kept out of training and completed
+            for each report, 0 or more; at most a tenth of the dataset.
         report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
             on from the last checkpoint.
         seed: Seed of the first weights and of the batches, 0 or more.
@@ -86,17 +120,20 @@ class TrainConfig:
         ValueError: A setting is outside its range.
     """
 
-    architecture: Architecture = Architecture()
+    architecture: Completion | Architecture = Completion()
     inputs: InputConfig = InputConfig()
     steps: int = 10_000
     batch: int = 32
     optimizer: Optimizer = "muon"
     learning_rate: float = 4e-3
     schedule: Schedule = "cosine"
+    average: float = 0.998
     occupied_weight: float = 1.5
+    occluded_weight: float = 2.0
     code_noise: float = 0.0
-    code_weight: float = 0.0
+    code_weight: float = 1.0
     bfloat16: bool = False
+    validation: int = 128
     report_every: int = 100
     seed: int = 0
 
@@ -105,26 +142,33 @@ class TrainConfig:
         checks.one_of("schedule", self.schedule, get_args(Schedule))
         for name in ("steps", "batch", "report_every"):
             checks.whole(name, getattr(self, name), 1)
-        for name in ("learning_rate", "occupied_weight"):
+        checks.within("average", self.average, 0, 1)
+        checks.whole("validation", self.validation, 0)
+        for name in ("learning_rate", "occupied_weight", "occluded_weight"):
             checks.positive(name, getattr(self, name))
         for name in ("code_noise", "code_weight"):
             checks.at_least(name, getattr(self, name), 0)
         checks.whole("seed", self.seed, 0)
 
 
+_AUTOENCODER = TrainConfig(Architecture(), average=0.0, occluded_weight=1.0, code_weight=0.0)
+
 PRESETS = {
     "default": TrainConfig(),
-    # Single clean views, the plain loss, a constant step. The length is not given; this is twenty
-    # passes over the paper's 69,444 pairs, 18 views of 3,858 chairs.
-    "paper": TrainConfig(
-        Architecture(decoder=(256, 128, 64)),
-        InputConfig(max_views=1, complete=0.0, mirror=False, scale=0.0, pose_error=0.0,
-                    missing=0.0, segmentation=0.0),
+    "autoencoder": _AUTOENCODER,
+    # Single clean views (the dataset of that name), the plain loss, a constant step. The length is
+    # not given; this is twenty passes over the paper's 69,444 pairs, 18 views of 3,858 chairs.
+    "paper": replace(
+        _AUTOENCODER,
+        architecture=Architecture(decoder=(256, 128, 64)),
+        inputs=InputConfig(complete=0.0, mirror=False),
         steps=43_402,
         optimizer="adam",
         learning_rate=1e-4,
         schedule="constant",
         occupied_weight=1.0,
+        validation=0,
     ),
-}  # fmt: skip
-"""Training runs by name: what we found best, and the paper's own (section 2.3)."""
+}
+"""Training runs by name: what we found best, the best of the paper's network, and the paper's own
+(section 2.3)."""

@@ -1,4 +1,4 @@
-"""Training the auto-encoder to complete partial grids (paper, section 2.3).
+"""Training a network to complete partial grids (paper, section 2.3).
 
 `train` yields after every report, so that the caller draws progress; everything it needs to go on
 after a kill is in the checkpoint, and a run that was killed and resumed ends with the same weights
@@ -9,7 +9,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from jax import lax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 from optax.contrib import MuonDimensionNumbers, muon
 from safetensors import safe_open
 from safetensors.numpy import save_file
@@ -33,9 +33,9 @@ from jaxshape.data.inputs import draw_pair
 from jaxshape.files import atomic_path, write_text
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
-from jaxshape.model.autoencoder import AUTOENCODER, AutoEncoder, architecture_of, initialize
-from jaxshape.model.config import TrainConfig
-from jaxshape.model.shapes import ShapePrior, encode
+from jaxshape.model.config import Completion, TrainConfig
+from jaxshape.model.families import Batch, family_of
+from jaxshape.model.shapes import ShapeModel, ShapePrior, decode, encode
 from jaxshape.model.weights import fingerprint, flatten
 
 
@@ -44,13 +44,15 @@ class TrainState(NamedTuple):
 
     Attributes:
         step: Steps taken so far.
-        variables: Flax collections `params` and `batch_stats`.
+        variables: Parameters under `params`, and what else the network keeps.
         optimizer: State of the optimiser.
+        average: Running average of the parameters; empty where none is kept.
     """
 
     step: Int[Array, ""]
-    variables: PyTree
+    variables: dict[str, PyTree]
     optimizer: PyTree
+    average: PyTree
 
 
 class Report(NamedTuple):
@@ -60,6 +62,9 @@ class Report(NamedTuple):
         step: Steps taken so far.
         loss: Training loss, in nats per voxel (paper, section 2.3).
         iou: IoU of the completed training grids, at threshold 0.5, from 0 to 1.
+        validation_iou: IoU of the decoded first codes of objects kept out of training; NaN where
+            none are.
+        validation_occluded: The same in occluded voxels alone.
         samples_per_second: Pairs per second.
         seconds: Time spent on these steps.
     """
@@ -67,6 +72,8 @@ class Report(NamedTuple):
     step: int
     loss: float
     iou: float
+    validation_iou: float
+    validation_occluded: float
     samples_per_second: float
     seconds: float
 
@@ -107,31 +114,31 @@ def initial_state(config: TrainConfig, start: ShapePrior | None = None) -> Train
     Raises:
         ValueError: The weights to start from are of another model or of other sizes.
     """
+    family = family_of(config.architecture)
     if start is None:
-        variables = initialize(jax.random.key(config.seed), config.architecture)
-    elif start.model != AUTOENCODER:
+        variables = family.initialize(jax.random.key(config.seed), config.architecture)
+    elif start.model != family.model:
         raise ValueError(
-            f"The weights to start from are of the kind {start.model.kind!r}; "
-            f"give those of an {AUTOENCODER.kind}."
+            f"The weights to start from are of the kind {start.model.kind!r}, "
+            f"the run is of {family.model.kind!r}; give weights of that kind."
         )
-    elif architecture_of(start.params) == config.architecture:
-        variables = jax.tree.map(jnp.array, start.params)  # a copy: steps give theirs away
+    elif family.architecture_of(start.params) == config.architecture:
+        # A copy: steps give theirs away.
+        variables = family.variables(jax.tree.map(jnp.array, start.params))
     else:
         raise ValueError(
-            f"The weights to start from are of {architecture_of(start.params)}, "
+            f"The weights to start from are of {family.architecture_of(start.params)}, "
             f"the run of {config.architecture}; give the same sizes to both."
         )
+    params = variables["params"]
+    average = jax.tree.map(jnp.array, params) if config.average else ()
     return TrainState(
-        jnp.zeros((), jnp.int32), variables, optimizer_for(config).init(variables["params"])
+        jnp.zeros((), jnp.int32), variables, optimizer_for(config).init(params), average
     )
 
 
 def train_step(
-    state: TrainState,
-    measured: Bool[Array, "b x y z"],
-    surface: Bool[Array, "b x y z"],
-    config: TrainConfig,
-    axis: str | None = None,
+    state: TrainState, batch: Batch, config: TrainConfig, axis: str | None = None
 ) -> tuple[TrainState, tuple[Float[Array, ""], Float[Array, ""]]]:
     """One step of the optimiser on a batch.
 
@@ -140,58 +147,51 @@ def train_step(
 
     Args:
         state: State before the step.
-        measured: Measurement grids F of the batch `[b x y z]`.
-        surface: Complete surfaces of the batch `[b x y z]`.
+        batch: Training pairs.
         config: Settings of the run.
         axis: Mesh axis over which the batch is spread; None where it is not spread.
 
     Returns:
         The state after the step, and the loss, in nats per voxel, and the mean IoU of the batch.
     """
-    dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32
-    network = AutoEncoder(config.architecture, dtype, axis)
-    noise = _code_noise(state.step, len(measured), config, axis)
+    noise = _noise(state.step, len(batch.surface), config, axis)
     over_all = partial(lax.pmean, axis_name=axis) if axis else lambda x: x
+    cost_of = family_of(config.architecture).cost
 
     def loss_of(params):
-        variables = {**state.variables, "params": params}
-        (logits, code), updates = network.apply(
-            variables, measured, train=True, noise=noise, mutable=["batch_stats"]
-        )
-        weights = jnp.where(surface, config.occupied_weight, 1.0)
-        loss = jnp.mean(weights * optax.sigmoid_binary_cross_entropy(logits, surface))
-        voxels = math.prod(surface.shape[1:])
-        length = 0.5 * jnp.mean(jnp.sum(code**2, axis=-1)) / voxels
-        return loss + config.code_weight * length, (updates, logits > 0)
+        cost = cost_of({**state.variables, "params": params}, batch, noise, config, axis)
+        return cost.loss, cost
 
     params = state.variables["params"]
-    (loss, (updates, completed)), gradients = jax.value_and_grad(loss_of, has_aux=True)(params)
+    gradients, cost = jax.grad(loss_of, has_aux=True)(params)
     moves, optimizer = optimizer_for(config).update(over_all(gradients), state.optimizer, params)
-    variables = {"params": optax.apply_updates(params, moves), **updates}
-    figures = loss, jnp.mean(iou(completed, surface))
-    return TrainState(state.step + 1, variables, optimizer), over_all(figures)
+    params = optax.apply_updates(params, moves)
+    average = ()
+    if config.average:
+        share = jnp.minimum(config.average, (1 + state.step) / (10 + state.step))
+        average = optax.incremental_update(params, state.average, 1 - share)
+    figures = cost.loss, jnp.mean(iou(cost.completed, batch.surface))
+    variables = {"params": params, **cost.variables}
+    return TrainState(state.step + 1, variables, optimizer, average), over_all(figures)
 
 
-def _code_noise(step, count, config: TrainConfig, axis):
+def _noise(step, count, config: TrainConfig, axis):
     """Noise for each code of this device's part; a function of its place in the whole batch."""
-    if not config.code_noise:
-        return 0.0
     key = jax.random.fold_in(jax.random.key(config.seed + 1), step)
     first = lax.axis_index(axis) * count if axis else 0
     keys = jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(count))
-    draw = partial(jax.random.normal, shape=(config.architecture.code,))
-    return config.code_noise * jax.vmap(draw)(keys)
+    return jax.vmap(partial(jax.random.normal, shape=(config.architecture.code,)))(keys)
 
 
 def batch_of(
     dataset: Dataset, config: TrainConfig, step: int, part: tuple[int, int] = (0, 1)
-) -> tuple[Bool[np.ndarray, "b x y z"], Bool[np.ndarray, "b x y z"]]:
-    """The measurements and complete surfaces of one step; a function of the seed and the step.
+) -> Batch:
+    """The training pairs of one step; a function of the seed and the step.
 
     Objects come in a new order each epoch, and each pair has random numbers of its own, so that
     `part` i of n of a batch is what it would be in the whole.
     """
-    count, (index, parts) = len(dataset.names), part
+    count, (index, parts) = len(dataset.names) - validation_size(dataset, config), part
     size = config.batch // parts
     first = step * config.batch + index * size
     places = range(first, first + size)
@@ -199,14 +199,48 @@ def batch_of(
               for e in {place // count for place in places}}  # fmt: skip
     pairs = [
         draw_pair(
-            dataset.packed(int(orders[place // count][place % count])),
+            dataset,
+            int(orders[place // count][place % count]),
             config.inputs,
             np.random.default_rng((config.seed, 1, place)),
         )
         for place in places
     ]
-    measured, surface = zip(*pairs, strict=True)
-    return np.stack(measured), np.stack(surface)
+    return _stacked(pairs)
+
+
+def _stacked(pairs: Sequence[tuple[Grids, np.ndarray]]) -> Batch:
+    grids, surfaces = zip(*pairs, strict=True)
+    F, M, _ = zip(*grids, strict=True)
+    return Batch(np.stack(F), np.stack(M), np.stack(surfaces))
+
+
+def validation_size(dataset: Dataset, config: TrainConfig) -> int:
+    """Objects kept out of training, at the end of the dataset; at most a tenth of it."""
+    return min(config.validation, len(dataset.names) // 10)
+
+
+def validation_batch(dataset: Dataset, config: TrainConfig) -> Batch | None:
+    """One input of each object that is kept out of training; None where none is."""
+    count = len(dataset.names)
+    kept = range(count - validation_size(dataset, config), count)
+    rngs = (np.random.default_rng((config.seed, 2, index)) for index in kept)
+    pairs = [draw_pair(dataset, i, config.inputs, rng) for i, rng in zip(kept, rngs, strict=True)]
+    return _stacked(pairs) if pairs else None
+
+
+@partial(jax.jit, static_argnums=0)
+def validate(
+    family_model: ShapeModel, params: PyTree, batch: Batch
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean IoU of the decoded first codes, everywhere and in occluded voxels."""
+    unused = jnp.zeros(1)
+    prior = ShapePrior(family_model, params, unused, unused[None])
+    completed = decode(prior, family_model.encode(params, batch.grids), batch.grids) > 0
+    hidden = batch.occluded > 0.5
+    return jnp.mean(iou(completed, batch.surface)), jnp.mean(
+        iou(completed & hidden, batch.surface & hidden)
+    )
 
 
 # ------------------------------------------------------------------ a run
@@ -241,9 +275,9 @@ def train(
     folder = Path(folder)
     if dataset.resolution != config.architecture.resolution:
         raise ValueError(
-            f"The dataset holds grids of {dataset.resolution}^3 voxels, and the network has layers "
-            f"for {config.architecture.resolution}^3; give --encoder and --decoder one layer more "
-            "or less, or build the dataset with another --resolution."
+            f"The dataset holds grids of {dataset.resolution}^3 voxels, and the network is "
+            f"made for {config.architecture.resolution}^3; give it others (--resolution, or for an "
+            "auto-encoder one layer more or less), or build the dataset with another --resolution."
         )
     devices, processes = jax.device_count(), jax.process_count()
     if config.batch % devices:
@@ -257,17 +291,19 @@ def train(
     run = _identity(config, start)
     state = jax.tree.map(share, _agreed_state(folder, run, config, start))
     step_fn = _parallel_step(config, mesh)
+    kept = validation_batch(dataset, config)
     metrics, began = [], time.perf_counter()
     for step in range(int(state.step), config.steps):
         batch = batch_of(dataset, config, step, (jax.process_index(), processes))
-        batch = [jax.make_array_from_process_local_data(spread, x) for x in batch]
-        state, outcome = step_fn(state, *batch)
+        batch = jax.tree.map(partial(jax.make_array_from_process_local_data, spread), batch)
+        state, outcome = step_fn(state, batch)
         metrics.append(outcome)
         if (step + 1) % config.report_every == 0 or step + 1 == config.steps:
             loss, overlap = np.mean(jax.device_get(metrics), axis=0)
             seconds = time.perf_counter() - began
             rate = config.batch * len(metrics) / seconds
-            report = Report(step + 1, float(loss), float(overlap), rate, seconds)
+            scores = _scores(state, config, kept)
+            report = Report(step + 1, float(loss), float(overlap), *scores, rate, seconds)
             if jax.process_index() == 0:
                 _record(folder, report)
                 save_checkpoint(folder, state, run)
@@ -281,11 +317,24 @@ def _parallel_step(config: TrainConfig, mesh: Mesh):
     step = jax.shard_map(
         partial(train_step, config=config, axis=axis),
         mesh=mesh,
-        in_specs=(P(), P("batch"), P("batch")),
+        in_specs=(P(), P("batch")),
         out_specs=P(),
         check_vma=False,  # the convolutions' own derivatives do not say how they vary
     )
     return jax.jit(step, donate_argnums=0)
+
+
+def _scores(state: TrainState, config: TrainConfig, kept: Batch | None) -> tuple[float, float]:
+    if kept is None:
+        return math.nan, math.nan
+    family = family_of(config.architecture)
+    scores = validate(family.model, jax.device_get(family.params(averaged(state))), kept)
+    return float(scores[0]), float(scores[1])
+
+
+def averaged(state: TrainState) -> dict[str, PyTree]:
+    """The variables of a run, with the running average of the parameters where one is kept."""
+    return state.variables | ({"params": state.average} if state.average else {})
 
 
 def finished_prior(
@@ -299,14 +348,18 @@ def finished_prior(
         config: Settings of the run.
         samples: Codes from which the statistics are computed, at most.
     """
-    variables = _read_checkpoint(Path(folder) / "checkpoint.safetensors", config).variables
-    many = replace(config, batch=64, seed=config.seed + 1)
+    state = _read_checkpoint(Path(folder) / "checkpoint.safetensors", config)
+    family = family_of(config.architecture)
     d = config.architecture.code
-    prior = ShapePrior(AUTOENCODER, variables, jnp.zeros(d), jnp.eye(d))
-    encode_batch = jax.jit(lambda prior, measured: encode(prior, Grids(measured, ~measured)))
+    params = jax.tree.map(jnp.asarray, family.params(averaged(state)))
+    prior = ShapePrior(family.model, params, jnp.zeros(d), jnp.eye(d))
+    if isinstance(config.architecture, Completion):
+        return prior  # its codes are made to have mean 0 and covariance 1
+    many = replace(config, batch=64, seed=config.seed + 1)
+    encode_batch = jax.jit(lambda prior, batch: encode(prior, batch.grids))
     steps = -(-min(samples, len(dataset.names)) // many.batch)
     codes = np.concatenate(
-        [encode_batch(prior, batch_of(dataset, many, step)[0]) for step in range(steps)]
+        [encode_batch(prior, batch_of(dataset, many, step)) for step in range(steps)]
     )
     covariance = np.cov(codes, rowvar=False)
     # Directions no code uses keep a little room to search in.

@@ -17,12 +17,13 @@ from safetensors.numpy import save_file
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.autoencoder import AUTOENCODER
+from jaxshape.model.completion import COMPLETION
 from jaxshape.model.pca import PCA
 from jaxshape.model.shapes import ShapeModel, ShapePrior, resolution_of
 
 FORMAT = "jaxshape-shape-prior-1"
 
-MODELS = {model.kind: model for model in (AUTOENCODER, PCA)}
+MODELS = {model.kind: model for model in (AUTOENCODER, COMPLETION, PCA)}
 """The kinds of shape models that come with the package."""
 
 

@@ -1,0 +1,245 @@
+"""A network conditioned on what was measured: detail passes by the code, which carries the rest.
+
+`COMPLETION` is its `ShapeModel`, a conditional variational auto-encoder with the skip connections
+of a U-Net. What was measured (soft F and M) goes down from 16^3 to 4^3 voxels of features, once for
+each object; a code joins them at 4^3 and on the way up again, where the features come in at each
+size. Codes of all objects are normally distributed with mean 0 and variance 1, given what was
+measured, so that the first code is 0 and half the squared length of a code is its cost in nats.
+
+In training a posterior network sees the complete shape too and says which codes lead to it.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from jaxshape.geometry.grids import Grids
+from jaxshape.model.config import Completion
+from jaxshape.model.shapes import Precision, Prepared, ShapeModel
+from jaxshape.model.stencil import convolve, multiply
+
+PATCH = 2
+"""Voxels along each side of the patches that become the first features."""
+
+Features = Float[Array, "b x y z channels"]
+
+
+class Skips(NamedTuple):
+    """Features of what was measured, from fine to coarse.
+
+    Attributes:
+        fine: At half the resolution of the grids.
+        middle: At a quarter.
+        coarse: At an eighth.
+    """
+
+    fine: Features
+    middle: Features
+    coarse: Features
+
+
+# ------------------------------------------------------------------ parameters
+
+
+def initialize(key: PRNGKeyArray, architecture: Completion) -> PyTree:
+    """Parameters of an untrained network, as a tree of dictionaries.
+
+    Args:
+        key: Random key of the first weights.
+        architecture: Sizes of the network.
+    """
+    draw = _Draw(key)
+    fine, middle, coarse = architecture.channels
+    patch = PATCH**3
+    cells = (architecture.resolution // 8) ** 3
+    q = [max(8, c // 2) for c in architecture.channels]
+    return {
+        "measured": {
+            "stem": draw.dense(2 * patch, fine),
+            "fine": draw.block(fine),
+            "down1": draw.dense(patch * fine, middle),
+            "middle": [draw.block(middle) for _ in range(architecture.depth)],
+            "down2": draw.dense(patch * middle, coarse),
+            "coarse": [draw.block(coarse) for _ in range(architecture.depth)],
+        },
+        "decoder": {
+            "code": draw.dense(architecture.code, cells * coarse, scale=0.1),
+            "coarse": draw.block(coarse, architecture.code),
+            "up1": draw.dense(coarse, patch * middle),
+            "middle": [draw.block(middle, architecture.code) for _ in range(architecture.depth)],
+            "up2": draw.dense(middle, patch * fine),
+            "fine": draw.block(fine, architecture.code),
+            "logits": draw.dense(fine, patch, scale=0.1),
+        },
+        "posterior": {
+            "stem": draw.dense(3 * patch, q[0]),
+            "down1": draw.dense(patch * q[0], q[1]),
+            "middle": draw.block(q[1]),
+            "down2": draw.dense(patch * q[1], q[2]),
+            "coarse": draw.block(q[2]),
+            "squeeze": draw.dense(q[2], q[0]),
+            "code": draw.dense(cells * q[0], 2 * architecture.code, scale=0.1),
+        },
+    }
+
+
+class _Draw:
+    """Draws the first weights, each with a key of its own."""
+
+    def __init__(self, key: PRNGKeyArray) -> None:
+        self.key, self.count = key, 0
+
+    def normal(self, *shape: int, fan_in: int, scale: float = 1.0) -> Array:
+        self.count += 1
+        draw = jax.random.normal(jax.random.fold_in(self.key, self.count), shape)
+        return scale * draw / jnp.sqrt(fan_in)
+
+    def dense(self, inputs: int, outputs: int, scale: float = 1.0) -> dict[str, Array]:
+        return {"kernel": self.normal(inputs, outputs, fan_in=inputs, scale=scale),
+                "bias": jnp.zeros(outputs)}  # fmt: skip
+
+    def block(self, channels: int, code: int = 0) -> dict[str, Any]:
+        kernel = self.normal(3, 3, 3, channels, channels, fan_in=27 * channels)
+        block = {"scale": jnp.ones(channels), "kernel": kernel,
+                 "mix": self.dense(channels, channels, scale=0.3)}  # fmt: skip
+        return block | ({"code": self.dense(code, channels, scale=0.1)} if code else {})
+
+
+# ------------------------------------------------------------------ layers
+
+
+def _dense(x, layer):
+    return multiply(x, layer["kernel"].astype(x.dtype)) + layer["bias"].astype(x.dtype)
+
+
+def _normalized(x, scale):
+    """Features of root mean square 1 in each voxel, scaled by channel."""
+    wide = x.astype(jnp.float32)
+    mean = jnp.mean(wide * wide, axis=-1, keepdims=True)
+    return (wide * jax.lax.rsqrt(mean + 1e-6) * scale).astype(x.dtype)
+
+
+def _block(x, block, code=None):
+    """x + W act(K * act(norm(x)) + V code), with a 3^3 kernel K."""
+    y = convolve(jax.nn.silu(_normalized(x, block["scale"])), block["kernel"].astype(x.dtype))
+    if code is not None:
+        y = y + _dense(code, block["code"])[:, None, None, None].astype(y.dtype)
+    return x + _dense(jax.nn.silu(y), block["mix"])
+
+
+def _gathered(x: Float[Array, "b x y z c"]) -> Features:
+    """Each 2^3 voxels become one, with all their channels."""
+    b, n, _, _, c = x.shape
+    m = n // PATCH
+    x = x.reshape(b, m, PATCH, m, PATCH, m, PATCH, c).transpose(0, 1, 3, 5, 2, 4, 6, 7)
+    return x.reshape(b, m, m, m, PATCH**3 * c)
+
+
+def _spread(x: Features) -> Features:
+    """The inverse of `_gathered`: each voxel becomes 2^3."""
+    b, m, _, _, c = x.shape
+    x = x.reshape(b, m, m, m, PATCH, PATCH, PATCH, c // PATCH**3)
+    x = x.transpose(0, 1, 4, 2, 5, 3, 6, 7)
+    return x.reshape(b, PATCH * m, PATCH * m, PATCH * m, c // PATCH**3)
+
+
+# ------------------------------------------------------------------ networks
+
+
+def evidence_of(grids: Grids) -> Float[Array, "b x y z 2"]:
+    """Probabilities of measured surface and of free space."""
+    F, M = (jnp.asarray(x).astype(jnp.float32) for x in grids[:2])
+    return jnp.stack([F * (1 - M), (1 - F) * (1 - M)], axis=-1)
+
+
+def skips(params: PyTree, grids: Grids, dtype: Any = jnp.float32) -> Skips:
+    """Features of what was measured."""
+    net = params["measured"]
+    fine = _dense(_gathered(evidence_of(grids).astype(dtype)), net["stem"])
+    fine = _block(fine, net["fine"])
+    middle = _dense(_gathered(fine), net["down1"])
+    for block in net["middle"]:
+        middle = _block(middle, block)
+    coarse = _dense(_gathered(middle), net["down2"])
+    for block in net["coarse"]:
+        coarse = _block(coarse, block)
+    return Skips(fine, middle, coarse)
+
+
+def decode_skips(
+    params: PyTree, found: Skips, code: Float[Array, "b d"]
+) -> Float[Array, "b x y z"]:
+    """Logits of codes, each with the features of its own object."""
+    net, code = params["decoder"], code.astype(found.fine.dtype)
+    x = found.coarse + _dense(code, net["code"]).reshape(found.coarse.shape)
+    x = _block(x, net["coarse"], code)
+    x = found.middle + _spread(_dense(x, net["up1"]))
+    for block in net["middle"]:
+        x = _block(x, block, code)
+    x = found.fine + _spread(_dense(x, net["up2"]))
+    x = _block(x, net["fine"], code)
+    return _spread(_dense(x, net["logits"]).astype(jnp.float32))[..., 0]
+
+
+def posterior(
+    params: PyTree, grids: Grids, surface: Bool[Array, "b x y z"], dtype: Any = jnp.float32
+) -> tuple[Float[Array, "b d"], Float[Array, "b d"]]:
+    """Mean and log-variance of the codes that lead to a complete surface."""
+    net = params["posterior"]
+    seen = jnp.concatenate([evidence_of(grids), surface[..., None].astype(jnp.float32)], axis=-1)
+    x = _dense(_gathered(seen.astype(dtype)), net["stem"])
+    x = _block(_dense(_gathered(jax.nn.silu(x)), net["down1"]), net["middle"])
+    x = _block(_dense(_gathered(x), net["down2"]), net["coarse"])
+    x = jax.nn.silu(_dense(x, net["squeeze"])).reshape(len(x), -1)
+    mean, log_variance = jnp.split(_dense(x, net["code"]).astype(jnp.float32), 2, axis=-1)
+    return mean, jnp.clip(log_variance, -10.0, 3.0)
+
+
+# ------------------------------------------------------------------ the shape model
+
+
+def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
+    """The most probable code given what was measured: 0."""
+    return jnp.zeros((len(grids.occupied), architecture_of(params).code))
+
+
+def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
+    """Features of each object's measurement; those of an unseen object without one."""
+    if grids is None:
+        n = architecture_of(params).resolution
+        grids = Grids(jnp.zeros((1, n, n, n)), jnp.ones((1, n, n, n)))
+    dtype = jnp.bfloat16 if precision == "bfloat16" else jnp.float32
+    found = skips(params, grids)
+    shared = {"decoder": params["decoder"]}
+    return Prepared(shared, jax.tree.map(lambda x: x.astype(dtype), found))
+
+
+def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y z"]:
+    """Logits of codes, each with the features of its object."""
+    return decode_skips(prepared.shared, prepared.own, code)
+
+
+def architecture_of(params: PyTree) -> Completion:
+    """Read the sizes off the parameters, given as arrays or as their shapes."""
+    down, decoder = params["measured"], params["decoder"]
+    code, cells = decoder["code"]["kernel"].shape
+    coarse = down["down2"]["kernel"].shape[-1]
+    return Completion(
+        channels=(down["stem"]["kernel"].shape[-1], down["down1"]["kernel"].shape[-1], coarse),
+        depth=len(down["middle"]),
+        code=code,
+        resolution=8 * round((cells / coarse) ** (1 / 3)),
+    )
+
+
+def shapes(params: PyTree) -> PyTree:
+    """The arrays, as shapes, of a network of the sizes that the parameters seem to have."""
+    architecture = architecture_of(params)
+    return jax.eval_shape(partial(initialize, architecture=architecture), jax.random.key(0))
+
+
+COMPLETION = ShapeModel("completion", encode, decode, prepare, shapes)
+"""Conditional network whose decoder takes what was measured."""
