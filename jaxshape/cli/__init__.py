@@ -15,6 +15,7 @@ leaves earlier output as it was. JAX, and all that needs it, is imported inside 
 
 import sys
 import warnings
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -29,14 +30,19 @@ from jaxshape.cli.rebuild import Demo
 from jaxshape.cli.recording import Reconstruct
 from jaxshape.cli.scoring import Evaluate, Plot
 from jaxshape.cli.viewing import ViewResult
+from jaxshape.data.config import DATASETS
+from jaxshape.model.config import PRESETS
 from jaxshape.process import prepare_process
 
 
-def commands(train: Train) -> Any:
-    """The table of commands; `train` holds the defaults of its own."""
+def commands(arguments: Sequence[str]) -> Any:
+    """The table of commands; --preset decides the defaults of `dataset` and `train`."""
+    preset = preset_in(arguments)
+    dataset = BuildDataset(tyro.MISSING, config=DATASETS.get(preset, DATASETS["default"]))
+    train = Train(config=PRESETS[preset])
     return (
         Annotated[Demo, subcommand("demo")]
-        | Annotated[BuildDataset, subcommand("dataset")]
+        | Annotated[BuildDataset, subcommand("dataset", default=dataset)]
         | Annotated[Train, subcommand("train", default=train)]
         | Annotated[Reconstruct, subcommand("reconstruct")]
         | Annotated[Inspect, subcommand("inspect")]
@@ -50,7 +56,7 @@ def main() -> None:
     """Run the command line; the entry point of the console script."""
     sys.path.append("")  # the current folder may hold a search of the user's own
     warnings.showwarning = lambda message, *_, **__: console.print(f"[yellow]warning[/] {message}")
-    table = commands(Train(config=preset_in(sys.argv[1:])))
+    table = commands(sys.argv[1:])
     try:
         command = tyro.cli(table, prog="jaxshape", registry=refusing())
         prepare_process()

@@ -6,7 +6,7 @@ import re
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,19 +17,27 @@ from jaxshape.cli.options import Axes, Machines
 from jaxshape.cli.scoring import load_models, score
 from jaxshape.data.config import DatasetConfig
 from jaxshape.files import write_json, write_text
-from jaxshape.model.config import PRESETS, TrainConfig
+from jaxshape.model.config import TrainConfig
 from jaxshape.search.config import RefineConfig
 
+OWN_MESHES = DatasetConfig(paths=4)
+"""The dataset of a folder of meshes, which are few: each is filmed more often."""
+
 PROCESSORS = os.cpu_count() or 1
+
+Preset = Literal["default", "paper"]
+TrainingPreset = Literal["default", "autoencoder", "paper"]
 
 
 @dataclass(frozen=True)
 class BuildDataset:
-    """Build training pairs: single views and complete surfaces, 4 KiB a grid.
+    """Build training pairs: what cameras measure along paths about objects, and whole surfaces.
 
     Examples: jaxshape dataset --output data/chairs
 
     jaxshape dataset --output data/mugs --meshes mugs/ --up z --front -y
+
+    jaxshape dataset --output data/paper --preset paper
     """
 
     output: Path
@@ -38,6 +46,9 @@ class BuildDataset:
     """Procedural chairs to make, unless --meshes is given."""
     meshes: Path | None = None
     """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural chairs."""
+    preset: Preset = "default"
+    """Defaults of the options below: the best that we found, or the paper's 18 clean single views,
+    which `jaxshape dataset --preset paper --help` shows."""
     config: tyro.conf.OmitArgPrefixes[DatasetConfig] = DatasetConfig()
     workers: int = PROCESSORS
     """Processes that work at the same time, 1 or more."""
@@ -70,20 +81,17 @@ def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: 
     )
 
 
-Preset = Literal["default", "paper"]
-
-
-def preset_in(arguments: Sequence[str]) -> TrainConfig:
-    """The settings that --preset asks for: the defaults of the other options of `train`."""
+def preset_in(arguments: Sequence[str]) -> TrainingPreset:
+    """The name that --preset gives: of the defaults of the other options of `dataset`, `train`."""
 
     @dataclass(frozen=True)
     class Asked:
-        preset: Preset = "default"
+        preset: TrainingPreset = "default"
 
     asked, _ = tyro.cli(
         Asked, prog="jaxshape", args=arguments, return_unknown_args=True, add_help=False
     )
-    return PRESETS[asked.preset]
+    return asked.preset
 
 
 @dataclass(frozen=True)
@@ -113,13 +121,14 @@ class Train:
     """Weights to begin with, of the same sizes, instead of random ones."""
     licence: str = "not stated"
     """Licence of the weights, for their card; the licence of the meshes may restrict it."""
-    model: Literal["autoencoder", "pca"] = "autoencoder"
-    """The paper's network, or principal components of the complete surfaces: a cheap rival, made in
-    seconds, of which --code numbers and --seed are the only settings."""
-    preset: Preset = "default"
-    """Defaults of the options below: the best that we found, or the paper's own, which
+    model: Literal["network", "pca"] = "network"
+    """A network, or principal components of the complete surfaces: a cheap rival, made in seconds,
+    of which --code numbers and --seed are the only settings."""
+    preset: TrainingPreset = "default"
+    """Network, and defaults of the options below: the network that is conditioned on what was
+    measured, the paper's auto-encoder at its best, or the paper's own training, which
     `jaxshape train --preset paper --help` shows."""
-    config: tyro.conf.OmitArgPrefixes[TrainConfig] = TrainConfig()
+    config: tyro.conf.OmitArgPrefixes[tyro.conf.AvoidSubcommands[TrainConfig]] = TrainConfig()
     machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
 
     def run(self) -> None:
@@ -174,7 +183,8 @@ class Train:
         )
         training, held_out = hold_out(list_meshes(self.meshes))
         models = load_models(held_out, self.axes)  # refused now, not after hours of training
-        config = DatasetConfig(
+        config = replace(
+            OWN_MESHES,
             up=self.axes.up,
             front=self.axes.front,
             resolution=self.config.architecture.resolution,

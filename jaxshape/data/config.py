@@ -61,7 +61,7 @@ class FaultConfig:
             checks.within(share, value, 0, 1)
 
 
-FAULTLESS = FaultConfig(0, 0, 0, 0, 0)
+FAULTLESS = FaultConfig(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ class DatasetConfig:
     Attributes:
         paths: Camera paths about each object, 1 or more. Each draws its own camera, views, noise
             and faults.
-        frames: Increasing numbers of frames, 1 or more each: after so many frames of each path, what
-            was measured becomes a training input.
+        frames: Increasing numbers of frames, 1 or more each: what was measured after so many frames
+            of each path becomes a training input.
         cameras: Names of the depth cameras of which each path draws one: "paper", "kinect",
             "realsense", "iphone-lidar". Frames of the paper's are fused as points, others as signed
             distances.

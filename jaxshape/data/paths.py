@@ -1,6 +1,7 @@
 """One training path: a camera moves about an object, and its frames are fused as they come. [host]
 
-Each path draws its own camera, poses, noise and faults. What was measured after a few numbers of frames becomes the training inputs.
+Each path draws its own camera, poses, noise and faults. What was measured after some numbers of
+frames becomes the training inputs.
 """
 
 from functools import partial

@@ -2,6 +2,7 @@ import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,13 +16,16 @@ from jaxshape.data.dataset import (
     DatasetError,
     build_dataset,
     hash_seed,
+    object_paths,
     open_dataset,
     pack,
-    training_grids,
+    pack_measured,
     unpack,
+    unpack_measured,
 )
+from jaxshape.geometry.grids import Grids
 
-CONFIG = DatasetConfig(views=2)
+CONFIG = DatasetConfig(paths=2, frames=(1, 2), cameras=("paper",))
 BOXES = {0: (0.4, 0.9, 0.5), OBJECTS_PER_SHARD: (0.6, 0.3, 0.2)}  # one in each of two shards
 
 
@@ -69,6 +73,24 @@ def test_unpacking_gives_back_what_was_packed_in_four_kib_a_grid(batch):
     np.testing.assert_array_equal(unpack(packed), grids)
 
 
+def test_binary_measurements_survive_packing_and_soft_ones_to_a_thirtieth():
+    rng = np.random.default_rng(0)
+    M = rng.random((2, 3, 16, 16, 16)) < 0.4
+    F = (rng.random(M.shape) < 0.2) & ~M
+    packed = pack_measured(Grids(F, M))
+    assert packed.shape == (2, 3, 16**3) and packed.dtype == np.uint8
+    again = unpack_measured(packed)
+    np.testing.assert_array_equal(again.occupied, F)
+    np.testing.assert_array_equal(again.occluded, M)
+    soft = Grids(rng.random(M.shape), rng.random(M.shape))
+    again = unpack_measured(pack_measured(soft))
+    for part in (lambda F, M: F * (1 - M), lambda F, M: (1 - F) * (1 - M), lambda F, M: M):
+        np.testing.assert_allclose(part(*again[:2]), part(*soft[:2]), atol=1.01 / 15)
+    np.testing.assert_allclose(
+        again.occupied * (1 - again.occluded), soft.occupied * (1 - soft.occluded), atol=0.51 / 15
+    )
+
+
 def test_the_first_voxels_are_the_highest_bits():
     grid = np.zeros((32, 32, 32), bool)
     grid[0, 0, 0] = grid[0, 0, 9] = True
@@ -93,26 +115,34 @@ def test_progress_counts_objects_and_what_was_skipped(objects, built):
 def test_what_is_read_is_what_was_made_of_each_object(objects, built):
     opened = open_dataset(built[0])
     assert opened.names == ["000", f"{OBJECTS_PER_SHARD:03d}"]
-    assert opened.views == CONFIG.views
+    assert opened.resolution == 32
     for index, place in enumerate(BOXES):
         mesh = dataset.load_object(objects[place]).mesh
-        expected = training_grids(mesh, CONFIG, hash_seed(CONFIG.seed, place))
-        np.testing.assert_array_equal(opened.packed(index), expected)
-        surface, *views = unpack(opened.packed(index))
-        assert surface[1:31, 1:31, 1:31].any() and not surface[3:29, 3:29, 3:29].any()
-        assert all(view.any() for view in views) and (views[0] != views[1]).any()
+        packed, measured = object_paths(mesh, CONFIG, hash_seed(CONFIG.seed, place))
+        assert opened.inputs_of(index) == (2, 2)
+        for path in range(2):
+            surface = opened.surface(index, path)
+            np.testing.assert_array_equal(surface, unpack(packed[path]))
+            assert surface[1:31, 1:31, 1:31].any() and not surface[5:27, 5:27, 5:27].any()
+            for number in range(2):
+                found = opened.grids(index, path, number)
+                np.testing.assert_array_equal(
+                    found.occupied, unpack_measured(measured[path, number]).occupied
+                )
+                assert found.occupied.any()
+        assert (opened.grids(index, 0, 0).occupied != opened.grids(index, 1, 0).occupied).any()
 
 
 def test_a_build_goes_on_where_it_was_killed(objects, built, copied):
     """The kill came while the arrays of the second shard were being written."""
     (copied / "shard-00001.json").unlink()
-    (copied / "shard-00001.npy").write_bytes(b"half")
-    untouched = (copied / "shard-00000.npy").stat()
+    (copied / "shard-00001.measured.npy").write_bytes(b"half")
+    untouched = (copied / "shard-00000.surface.npy").stat()
     progress = build_here(copied, objects)
     assert [p.objects for p in progress] == [OBJECTS_PER_SHARD, OBJECTS_PER_SHARD + 1]
     assert len(progress[-1].skipped) == OBJECTS_PER_SHARD - 1
     assert contents(copied) == contents(built[0])
-    assert (copied / "shard-00000.npy").stat().st_mtime_ns == untouched.st_mtime_ns
+    assert (copied / "shard-00000.surface.npy").stat().st_mtime_ns == untouched.st_mtime_ns
 
 
 def test_a_finished_build_has_nothing_left_to_do(objects, built):
@@ -124,7 +154,7 @@ def test_a_finished_build_has_nothing_left_to_do(objects, built):
 
 
 @pytest.mark.parametrize(
-    "config, count", [(DatasetConfig(views=3), None), (DatasetConfig(views=2, seed=1), None),
+    "config, count", [(replace(CONFIG, paths=3), None), (replace(CONFIG, seed=1), None),
                       (CONFIG, -1)],
 )  # fmt: skip
 def test_other_settings_or_objects_are_refused(objects, built, config, count):
@@ -159,17 +189,9 @@ def test_seeds_of_neighbours_differ_and_fit_31_bits():
     assert min(seeds) >= 0 and 2**30 < max(seeds) < 2**31
 
 
-def test_the_share_of_noisy_objects_is_the_one_asked_for(monkeypatch):
-    """Clean depth is used below the share, and faulty depth above: seen by what is captured."""
-    noisy = []
-
-    def stop(mesh, poses, *, noise, seed, resolution):
-        noisy.append(noise)
-        raise StopIteration
-
-    monkeypatch.setattr(dataset, "capture", stop)
-    monkeypatch.setattr(dataset.camera, "random_views", lambda *_: None)
-    for seed in range(200):
-        with pytest.raises(StopIteration):
-            training_grids(trimesh.creation.box(), DatasetConfig(noisy=0.3), seed)
-    assert 0.2 < np.mean(noisy) < 0.4
+def test_a_dataset_of_an_earlier_version_is_named(copied):
+    claim = json.loads((copied / "dataset.json").read_text())
+    del claim["format"]
+    (copied / "dataset.json").write_text(json.dumps(claim))
+    with pytest.raises(DatasetError, match="earlier version .* build it again"):
+        open_dataset(copied)

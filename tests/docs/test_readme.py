@@ -15,7 +15,6 @@ import tyro
 from orbit_recording import depth_path, write_recording
 
 from jaxshape import cli
-from jaxshape.cli.learning import Train, preset_in
 from jaxshape.cli.options import refusing
 from jaxshape.data.boxes import read_box
 
@@ -109,7 +108,7 @@ def test_nothing_is_overlooked():
 @pytest.mark.parametrize("line", sorted({line for _, line in COMMANDS if "jaxshape " in line[:9]}))
 def test_the_command_line_takes_it_as_it_stands(line):
     arguments = shlex.split(line)[1:]
-    table = cli.commands(Train(config=preset_in(arguments)))
+    table = cli.commands(arguments)
     assert tyro.cli(table, prog="jaxshape", args=arguments, registry=refusing())
 
 
