@@ -61,15 +61,15 @@ def initialize(key: PRNGKeyArray, architecture: Completion) -> PyTree:
             "stem": draw.dense(2 * patch, fine),
             "fine": draw.block(fine),
             "down1": draw.dense(patch * fine, middle),
-            "middle": [draw.block(middle) for _ in range(architecture.depth)],
+            "middle": draw.blocks(architecture.depth, middle),
             "down2": draw.dense(patch * middle, coarse),
-            "coarse": [draw.block(coarse) for _ in range(architecture.depth)],
+            "coarse": draw.blocks(architecture.depth, coarse),
         },
         "decoder": {
             "code": draw.dense(architecture.code, cells * coarse, scale=0.1),
             "coarse": draw.block(coarse, architecture.code),
             "up1": draw.dense(coarse, patch * middle),
-            "middle": [draw.block(middle, architecture.code) for _ in range(architecture.depth)],
+            "middle": draw.blocks(architecture.depth, middle, architecture.code),
             "up2": draw.dense(middle, patch * fine),
             "fine": draw.block(fine, architecture.code),
             "logits": draw.dense(fine, patch, scale=0.1),
@@ -107,6 +107,9 @@ class _Draw:
                  "mix": self.dense(channels, channels, scale=0.3)}  # fmt: skip
         return block | ({"code": self.dense(code, channels, scale=0.1)} if code else {})
 
+    def blocks(self, depth: int, channels: int, code: int = 0) -> dict[str, Any]:
+        return {str(i): self.block(channels, code) for i in range(depth)}
+
 
 # ------------------------------------------------------------------ layers
 
@@ -130,7 +133,13 @@ def _block(x, block, code=None):
     return x + _dense(jax.nn.silu(y), block["mix"])
 
 
-def _gathered(x: Float[Array, "b x y z c"]) -> Features:
+def _blocks(x, blocks, code=None):
+    for i in range(len(blocks)):
+        x = _block(x, blocks[str(i)], code)
+    return x
+
+
+def _gathered(x: Float[Array, "b x y z c"]) -> Float[Array, "b x//2 y//2 z//2 8*c"]:
     """Each 2^3 voxels become one, with all their channels."""
     b, n, _, _, c = x.shape
     m = n // PATCH
@@ -138,7 +147,7 @@ def _gathered(x: Float[Array, "b x y z c"]) -> Features:
     return x.reshape(b, m, m, m, PATCH**3 * c)
 
 
-def _spread(x: Features) -> Features:
+def _spread(x: Float[Array, "b x y z c"]) -> Float[Array, "b 2*x 2*y 2*z c//8"]:
     """The inverse of `_gathered`: each voxel becomes 2^3."""
     b, m, _, _, c = x.shape
     x = x.reshape(b, m, m, m, PATCH, PATCH, PATCH, c // PATCH**3)
@@ -160,12 +169,8 @@ def skips(params: PyTree, grids: Grids, dtype: Any = jnp.float32) -> Skips:
     net = params["measured"]
     fine = _dense(_gathered(evidence_of(grids).astype(dtype)), net["stem"])
     fine = _block(fine, net["fine"])
-    middle = _dense(_gathered(fine), net["down1"])
-    for block in net["middle"]:
-        middle = _block(middle, block)
-    coarse = _dense(_gathered(middle), net["down2"])
-    for block in net["coarse"]:
-        coarse = _block(coarse, block)
+    middle = _blocks(_dense(_gathered(fine), net["down1"]), net["middle"])
+    coarse = _blocks(_dense(_gathered(middle), net["down2"]), net["coarse"])
     return Skips(fine, middle, coarse)
 
 
@@ -177,8 +182,7 @@ def decode_skips(
     x = found.coarse + _dense(code, net["code"]).reshape(found.coarse.shape)
     x = _block(x, net["coarse"], code)
     x = found.middle + _spread(_dense(x, net["up1"]))
-    for block in net["middle"]:
-        x = _block(x, block, code)
+    x = _blocks(x, net["middle"], code)
     x = found.fine + _spread(_dense(x, net["up2"]))
     x = _block(x, net["fine"], code)
     return _spread(_dense(x, net["logits"]).astype(jnp.float32))[..., 0]

@@ -6,7 +6,6 @@ as one that was not: batches depend on the seed and the step alone.
 """
 
 import json
-import math
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -62,7 +61,7 @@ class Report(NamedTuple):
         step: Steps taken so far.
         loss: Training loss, in nats per voxel (paper, section 2.3).
         iou: IoU of the completed training grids, at threshold 0.5, from 0 to 1.
-        validation_iou: IoU of the decoded first codes of objects kept out of training; NaN where
+        validation_iou: IoU of the decoded first codes of objects kept out of training; None where
             none are.
         validation_occluded: The same in occluded voxels alone.
         samples_per_second: Pairs per second.
@@ -72,8 +71,8 @@ class Report(NamedTuple):
     step: int
     loss: float
     iou: float
-    validation_iou: float
-    validation_occluded: float
+    validation_iou: float | None
+    validation_occluded: float | None
     samples_per_second: float
     seconds: float
 
@@ -324,9 +323,12 @@ def _parallel_step(config: TrainConfig, mesh: Mesh):
     return jax.jit(step, donate_argnums=0)
 
 
-def _scores(state: TrainState, config: TrainConfig, kept: Batch | None) -> tuple[float, float]:
+def _scores(
+    state: TrainState, config: TrainConfig, kept: Batch | None
+) -> tuple[float | None, float | None]:
+    """IoU of the objects kept out of training, everywhere and in occluded voxels."""
     if kept is None:
-        return math.nan, math.nan
+        return None, None
     family = family_of(config.architecture)
     scores = validate(family.model, jax.device_get(family.params(averaged(state))), kept)
     return float(scores[0]), float(scores[1])

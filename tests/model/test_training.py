@@ -8,28 +8,36 @@ import numpy as np
 import optax
 import pytest
 import tiny_training
-from tiny_training import CONFIG, OBJECTS
+from tiny_training import CONFIG, NUMBERS, OBJECTS, PATHS
 
-from jaxshape.data.config import InputConfig
-from jaxshape.data.dataset import unpack
-from jaxshape.geometry.grids import Grids
-from jaxshape.model import training
-from jaxshape.model.config import PRESETS, Architecture
+from jaxshape.data.config import DATASETS, FAULTLESS, InputConfig
+from jaxshape.model import autoencoder, training
+from jaxshape.model.config import PRESETS, Architecture, Completion
+from jaxshape.model.families import Batch
 from jaxshape.model.shapes import encode
-from jaxshape.model.training import TrainState, batch_of, initial_state, read_metrics, train_step
+from jaxshape.model.training import (
+    TrainState,
+    batch_of,
+    initial_state,
+    read_metrics,
+    train_step,
+    validation_batch,
+    validation_size,
+)
 from jaxshape.model.weights import load_prior
 
-CLEAN = replace(
-    CONFIG,
-    inputs=InputConfig(max_views=3, complete=0.0, mirror=False, scale=0.0, pose_error=0.0,
-                       missing=0.0, segmentation=0.0),
-)  # fmt: skip
+SMALL = Completion((4, 4, 4), 1, 3, 16)
+CLEAN = replace(CONFIG, inputs=InputConfig(complete=0.0, mirror=False))
 
 
-def views_of(dataset, surface):
-    """The packed views of the object with a complete surface."""
-    index = next(i for i in range(OBJECTS) if np.array_equal(unpack(dataset.packed(i)[0]), surface))
-    return index, unpack(dataset.packed(index)[1:])
+def object_of(dataset, surface):
+    """Number and path of the object with a complete surface."""
+    return next(
+        (i, path)
+        for i in range(OBJECTS)
+        for path in range(PATHS)
+        if np.array_equal(dataset.surface(i, path), surface)
+    )
 
 
 # ------------------------------------------------------------------ batches
@@ -39,7 +47,7 @@ def test_a_batch_is_a_function_of_the_seed_and_the_step(dataset):
     first, again = batch_of(dataset, CONFIG, 3), batch_of(dataset, CONFIG, 3)
     jax.tree.map(np.testing.assert_array_equal, first, again)
     for other in (batch_of(dataset, CONFIG, 4), batch_of(dataset, replace(CONFIG, seed=1), 3)):
-        assert (first[0] != other[0]).any()
+        assert (first.occupied != other.occupied).any()
 
 
 @pytest.mark.parametrize("count", [2, 4])
@@ -52,22 +60,41 @@ def test_a_batch_in_parts_is_the_whole_batch(dataset, count):
 
 
 def test_each_epoch_visits_each_object_once_in_an_order_of_its_own(dataset):
-    surfaces = np.concatenate([batch_of(dataset, CLEAN, step)[1] for step in range(OBJECTS)])
-    visited = np.array([views_of(dataset, surface)[0] for surface in surfaces])
+    surfaces = np.concatenate([batch_of(dataset, CLEAN, step).surface for step in range(OBJECTS)])
+    visited = np.array([object_of(dataset, surface)[0] for surface in surfaces])
     epochs = visited.reshape(4, OBJECTS)  # 7 batches of 4 are four epochs of 7
     np.testing.assert_array_equal(np.sort(epochs), np.tile(np.arange(OBJECTS), (4, 1)))
     assert len({tuple(epoch) for epoch in epochs}) > 1
 
 
-def test_clean_inputs_are_unions_of_one_to_the_most_views_of_the_object_itself(dataset):
-    counts = set()
+def test_clean_inputs_are_measurements_of_the_object_itself(dataset):
+    drawn = set()
     for step in range(10):
-        for measured, surface in zip(*batch_of(dataset, CLEAN, step), strict=True):
-            views = views_of(dataset, surface)[1]
-            chosen = [view for view in views if not (view & ~measured).any()]
-            np.testing.assert_array_equal(np.any(chosen, axis=0), measured)
-            counts.add(len(chosen))
-    assert counts == {1, 2, 3}
+        for F, M, surface in zip(*batch_of(dataset, CLEAN, step), strict=True):
+            index, path = object_of(dataset, surface)
+            inputs = [dataset.grids(index, path, k) for k in range(NUMBERS)]
+            (number,) = [k for k in range(NUMBERS) if np.array_equal(inputs[k].occupied, F)]
+            np.testing.assert_array_equal(inputs[number].occluded, M)
+            drawn.add((path, number))
+    assert len(drawn) == PATHS * NUMBERS
+
+
+def test_objects_kept_out_are_in_no_batch_and_in_the_validation(monkeypatch, dataset):
+    monkeypatch.setattr(training, "validation_size", lambda *_: 2)
+    seen = {
+        object_of(dataset, surface)[0]
+        for step in range(10)
+        for surface in batch_of(dataset, CLEAN, step).surface
+    }
+    kept = [object_of(dataset, surface)[0] for surface in validation_batch(dataset, CLEAN).surface]
+    assert seen == set(range(OBJECTS - 2)) and kept == [OBJECTS - 2, OBJECTS - 1]
+
+
+def test_at_most_a_tenth_is_kept_out(dataset):
+    assert validation_size(dataset, CONFIG) == 0 and validation_batch(dataset, CONFIG) is None
+    many = dataset._replace(names=["x"] * 3000)
+    assert validation_size(many, CONFIG) == CONFIG.validation
+    assert validation_size(dataset._replace(names=["x"] * 50), CONFIG) == 5
 
 
 # ------------------------------------------------------------------ one step
@@ -92,7 +119,7 @@ LOGIT, CODE = 0.7, np.array([1.0, -2.0, 3.0], np.float32)
 @pytest.fixture
 def first_step(monkeypatch):
     """The step of a fixed network on grids of which an eighth is occupied."""
-    monkeypatch.setattr(training, "AutoEncoder", FixedNetwork)
+    monkeypatch.setattr(autoencoder, "AutoEncoder", FixedNetwork)
     surface = np.zeros((2, 32, 32, 32), bool)
     surface[:, :16, :16, :16] = True
     params = {"logit": jnp.float32(LOGIT), "code": jnp.asarray(CODE)}
@@ -100,8 +127,11 @@ def first_step(monkeypatch):
     def step(**settings):
         config = replace(CONFIG, **{"code_weight": 0.0} | settings)
         optimizer = training.optimizer_for(config).init(params)
-        state = TrainState(jnp.zeros((), jnp.int32), {"params": params}, optimizer)
-        state, (loss, iou) = jax.jit(partial(train_step, config=config))(state, surface, surface)
+        state = TrainState(jnp.zeros((), jnp.int32), {"params": params}, optimizer, ())
+        hidden = np.zeros(surface.shape, np.float32)
+        hidden[:, :8] = 1  # half of the surface, a quarter of all
+        batch = Batch(surface.astype(np.float32), hidden, surface)
+        state, (loss, iou) = jax.jit(partial(train_step, config=config))(state, batch)
         return float(loss), float(iou), state.variables["params"]
 
     return step
@@ -113,6 +143,30 @@ def test_the_loss_weighs_occupied_voxels(first_step):
         occupied, free = np.log1p(np.exp(-LOGIT)), np.log1p(np.exp(LOGIT))
         np.testing.assert_allclose(loss, weight * occupied / 8 + free * 7 / 8, rtol=1e-5)
         np.testing.assert_allclose(iou, 1 / 8)  # everything is completed
+
+
+def test_the_loss_weighs_occluded_voxels(first_step):
+    occupied, free = np.log1p(np.exp(-LOGIT)), np.log1p(np.exp(LOGIT))
+    loss, _, _ = first_step(occupied_weight=1.0, occluded_weight=3.0)
+    expected = occupied / 8 + free * 7 / 8 + 2 * (occupied / 16 + free * 3 / 16)
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+
+
+def test_the_running_average_follows_the_parameters_slowly():
+    config = replace(CONFIG, architecture=SMALL, average=0.9, bfloat16=False)
+    state = initial_state(config)
+    rng = np.random.default_rng(0)
+    surface = rng.random((2, 16, 16, 16)) < 0.2
+    batch = Batch(np.float32(surface), np.zeros(surface.shape, np.float32), surface)
+    step = jax.jit(partial(train_step, config=config))
+    average = state.average
+    for number in range(3):
+        state, _ = step(state, batch)
+        share = min(0.9, (1 + number) / (10 + number))
+        params = state.variables["params"]
+        average = jax.tree.map(lambda a, p, s=share: s * a + (1 - s) * p, average, params)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), state.average, average)
+    assert training.averaged(state)["params"] is state.average
 
 
 def test_the_weight_of_codes_adds_half_their_squared_length_a_voxel(first_step):
@@ -151,7 +205,7 @@ def test_the_cosine_schedule_warms_up_and_ends_with_steps_of_nothing():
 def losses_on_one_batch(step, state, batch, count):
     losses = []
     for _ in range(count):
-        state, (loss, _) = step(state, *batch)
+        state, (loss, _) = step(state, batch)
         losses.append(float(loss))
     assert int(state.step) == count
     assert all(x.dtype == np.float32 for x in jax.tree.leaves(state.variables))
@@ -244,8 +298,8 @@ def test_weights_of_other_sizes_are_no_start(start):
 def test_the_prior_describes_the_codes_of_the_training_set(dataset, whole_run, monkeypatch):
     tiny_training.make_quick(monkeypatch.setattr, whole_run.programs)
     prior = whole_run.prior
-    inputs, _ = batch_of(dataset, replace(CONFIG, batch=64, seed=CONFIG.seed + 1), 0)
-    codes = np.asarray(jax.jit(encode)(prior, Grids(inputs, ~inputs)))
+    batch = batch_of(dataset, replace(CONFIG, batch=64, seed=CONFIG.seed + 1), 0)
+    codes = np.asarray(jax.jit(encode)(prior, batch.grids))
     np.testing.assert_allclose(prior.code_mean, codes.mean(axis=0), atol=1e-5)
     covariance = np.asarray(prior.code_covariance)
     np.testing.assert_allclose(covariance, covariance.T)
@@ -261,10 +315,34 @@ def test_the_paper_preset_is_the_paper(dataset):
     assert (paper.optimizer, paper.learning_rate, paper.schedule) == ("adam", 1e-4, "constant")
     assert (paper.occupied_weight, paper.code_noise, paper.code_weight) == (1, 0, 0)
     assert paper.architecture == Architecture((32, 64, 128, 256), (256, 128, 64), 100)
-    for measured, surface in zip(*batch_of(dataset, replace(paper, batch=8), 0), strict=True):
-        assert any(np.array_equal(measured, view) for view in views_of(dataset, surface)[1])
+    data = DATASETS["paper"]
+    assert (data.paths, data.frames, data.cameras) == (18, (1,), ("paper",))
+    assert (data.noisy, data.arcs, data.faults) == (0, 0, FAULTLESS)
+    assert paper.inputs == InputConfig(complete=0.0, mirror=False)
+    assert (paper.average, paper.occluded_weight, paper.validation) == (0, 1, 0)
+
+
+@pytest.mark.slow
+def test_a_completion_network_learns_one_batch(dataset):
+    config = replace(
+        CONFIG, architecture=Completion((8, 16, 16), 1, 8), average=0.5, code_weight=1.0
+    )
+    batch = batch_of(dataset, config, 0)
+    state, step = initial_state(config), jax.jit(partial(train_step, config=config))
+    losses = losses_on_one_batch(step, state, batch, 60)
+    assert losses[-5:].mean() < 0.5 * losses[:5].mean()
+
+
+def test_the_prior_of_a_completion_network_is_normal(dataset, tmp_path):
+    config = replace(CONFIG, architecture=Completion((4, 4, 4), 1, 3), average=0.5)
+    state = initial_state(config)
+    training.save_checkpoint(tmp_path, state, "a run")
+    prior = training.finished_prior(tmp_path, dataset, config)
+    np.testing.assert_array_equal(prior.code_mean, np.zeros(3))
+    np.testing.assert_array_equal(prior.code_covariance, np.eye(3))
+    jax.tree.map(np.testing.assert_array_equal, prior.params, state.average)
 
 
 def test_weights_of_another_model_are_no_start(linear_prior):
-    with pytest.raises(ValueError, match="of the kind 'pca'; give those of an autoencoder"):
+    with pytest.raises(ValueError, match="of the kind 'pca', the run is of 'autoencoder'"):
         initial_state(CONFIG, linear_prior)

@@ -14,21 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxshape.data.config import InputConfig
-from jaxshape.data.dataset import Dataset, pack
+from jaxshape.data.dataset import Dataset, pack, pack_measured
+from jaxshape.geometry.grids import Grids
 from jaxshape.model import autoencoder, training
 from jaxshape.model.config import Architecture, TrainConfig
 from jaxshape.model.weights import load_prior
 from jaxshape.process import join_processes
 
-OBJECTS, VIEWS = 7, 4
+OBJECTS, PATHS, NUMBERS = 7, 2, 3
 CONFIG = TrainConfig(
     Architecture((4, 4, 8, 8), (8, 8, 4), 10),
-    InputConfig(max_views=3, scale=0.2),
+    InputConfig(complete=0.2),
     steps=5,
     batch=4,
     optimizer="adam",
     learning_rate=1e-3,
     schedule="constant",
+    average=0.0,
+    occluded_weight=1.0,
     code_noise=0.5,
     code_weight=10.0,
     report_every=2,
@@ -36,15 +39,18 @@ CONFIG = TrainConfig(
 
 
 def slabs() -> Dataset:
-    """Random slabs, and views that each hold a random half of one."""
+    """Random slabs along two paths each, and measurements that each hold a random half of one."""
     rng = np.random.default_rng(0)
-    surface = np.zeros((OBJECTS, 1, 32, 32, 32), bool)
+    surface = np.zeros((OBJECTS, PATHS, 32, 32, 32), bool)
     for i in range(OBJECTS):
-        surface[i, 0, 4 * i : 4 * i + 6, 5:27, 5:27] = True
-    views = surface & (rng.random((OBJECTS, VIEWS, 32, 32, 32)) < 0.5)
-    packed = pack(np.concatenate([surface, views], axis=1))
+        for j in range(PATHS):
+            surface[i, j, 4 * i : 4 * i + 6, 5:27, 5 + j : 27] = True
+    seen = rng.random((OBJECTS, PATHS, NUMBERS, 32, 32, 32)) < 0.5
+    measured = pack_measured(Grids(surface[:, :, None] & seen, ~seen))
     names = [f"object {i}" for i in range(OBJECTS)]
-    return Dataset(names, [packed[:4], packed[4:]], [(i // 4, i % 4) for i in range(OBJECTS)])
+    halves = lambda x: [x[:4], x[4:]]  # noqa: E731
+    row = [(i // 4, i % 4) for i in range(OBJECTS)]
+    return Dataset(names, halves(pack(surface)), halves(measured), row)
 
 
 # Convolutions by the eight taps in the middle alone compile in a fraction of the time.
