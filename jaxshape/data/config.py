@@ -134,6 +134,8 @@ class InputConfig:
     Attributes:
         complete: Share of the inputs that are the complete surface itself, from 0 to 1.
         mirror: Exchange left and right in half of the pairs.
+        warp: Each axis is stretched and squeezed along its length by up to this share, from 0 to
+            below 1: more proportions from the same objects.
 
     Raises:
         ValueError: A setting is outside its range.
@@ -141,7 +143,11 @@ class InputConfig:
 
     complete: float = 0.05
     mirror: bool = True
+    warp: float = 0.3
 
     def __post_init__(self) -> None:
         checks.one_of("mirror", self.mirror, (True, False))
         checks.within("complete", self.complete, 0, 1)
+        checks.within("warp", self.warp, 0, 1)
+        if self.warp == 1:
+            checks.refuse("warp", self.warp, "a number below 1, or nothing is left")

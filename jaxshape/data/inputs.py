@@ -1,11 +1,14 @@
 """Training pairs as a reconstruction would meet them. [host]"""
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from jaxshape.data.config import InputConfig
 from jaxshape.data.dataset import Dataset
 from jaxshape.geometry.grids import Grids
+
+KNOTS = 5
+"""Places along an axis between which its stretch changes evenly."""
 
 
 def draw_pair(
@@ -31,4 +34,38 @@ def draw_pair(
         grids = dataset.grids(index, path, number)
     if config.mirror and rng.random() < 0.5:
         grids, surface = Grids(grids.occupied[::-1], grids.occluded[::-1]), surface[::-1]
+    if config.warp:
+        return warped(grids, surface, config.warp, rng)
     return grids, surface
+
+
+def warped(
+    grids: Grids, surface: Bool[np.ndarray, "x y z"], share: float, rng: np.random.Generator
+) -> tuple[Grids, Bool[np.ndarray, "x y z"]]:
+    """The pair with other proportions: each axis by a random map that keeps both of its ends.
+
+    Where layers are squeezed into one, it is surface if any of them is, and free if all are, so
+    that no surface gets holes.
+    """
+    known = 1 - grids.occluded
+    seen, free = grids.occupied * known, (1 - grids.occupied) * known
+    for axis in range(3):
+        first = source_layers(len(surface), share, rng)
+        surface = np.logical_or.reduceat(surface, first, axis)
+        seen = np.maximum.reduceat(seen, first, axis)
+        free = np.minimum.reduceat(free, first, axis)
+    known = seen + free
+    return Grids(seen / np.where(known > 0, known, 1), 1 - known), surface
+
+
+def source_layers(count: int, share: float, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+    """The first layer of those that become each layer, by steps of 1 plus or minus `share`.
+
+    `reduceat` takes the layers up to the next entry, or the layer itself where the next is the
+    same.
+    """
+    steps = np.interp(
+        np.arange(count), np.linspace(0, count - 1, KNOTS), rng.uniform(1 - share, 1 + share, KNOTS)
+    )
+    ends = np.concatenate([[0], np.cumsum(steps)])
+    return np.floor(ends[:-1] * count / ends[-1] + 1e-6).astype(int)

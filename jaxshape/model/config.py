@@ -161,7 +161,7 @@ PRESETS = {
     "paper": replace(
         _AUTOENCODER,
         architecture=Architecture(decoder=(256, 128, 64)),
-        inputs=InputConfig(complete=0.0, mirror=False),
+        inputs=InputConfig(complete=0.0, mirror=False, warp=0.0),
         steps=43_402,
         optimizer="adam",
         learning_rate=1e-4,

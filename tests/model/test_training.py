@@ -27,7 +27,7 @@ from jaxshape.model.training import (
 from jaxshape.model.weights import load_prior
 
 SMALL = Completion((4, 4, 4), 1, 3, 16)
-CLEAN = replace(CONFIG, inputs=InputConfig(complete=0.0, mirror=False))
+CLEAN = replace(CONFIG, inputs=InputConfig(complete=0.0, mirror=False, warp=0.0))
 
 
 def object_of(dataset, surface):
@@ -318,7 +318,7 @@ def test_the_paper_preset_is_the_paper(dataset):
     data = DATASETS["paper"]
     assert (data.paths, data.frames, data.cameras) == (18, (1,), ("paper",))
     assert (data.noisy, data.arcs, data.faults) == (0, 0, FAULTLESS)
-    assert paper.inputs == InputConfig(complete=0.0, mirror=False)
+    assert paper.inputs == InputConfig(complete=0.0, mirror=False, warp=0.0)
     assert (paper.average, paper.occluded_weight, paper.validation) == (0, 1, 0)
 
 

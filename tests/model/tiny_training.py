@@ -24,7 +24,7 @@ from jaxshape.process import join_processes
 OBJECTS, PATHS, NUMBERS = 7, 2, 3
 CONFIG = TrainConfig(
     Architecture((4, 4, 8, 8), (8, 8, 4), 10),
-    InputConfig(complete=0.2),
+    InputConfig(complete=0.2, warp=0.2),
     steps=5,
     batch=4,
     optimizer="adam",
