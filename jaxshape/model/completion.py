@@ -24,6 +24,9 @@ from jaxshape.model.stencil import convolve, multiply
 PATCH = 2
 """Voxels along each side of the patches that become the first features."""
 
+CHANNELS = 4
+"""Channels of `evidence_of`."""
+
 Features = Float[Array, "b x y z channels"]
 
 
@@ -58,7 +61,7 @@ def initialize(key: PRNGKeyArray, architecture: Completion) -> PyTree:
     q = [max(8, c // 2) for c in architecture.channels]
     return {
         "measured": {
-            "stem": draw.dense(2 * patch, fine),
+            "stem": draw.dense(CHANNELS * patch, fine),
             "fine": draw.block(fine),
             "down1": draw.dense(patch * fine, middle),
             "middle": draw.blocks(architecture.depth, middle),
@@ -75,7 +78,7 @@ def initialize(key: PRNGKeyArray, architecture: Completion) -> PyTree:
             "logits": draw.dense(fine, patch, scale=0.1),
         },
         "posterior": {
-            "stem": draw.dense(3 * patch, q[0]),
+            "stem": draw.dense((CHANNELS + 1) * patch, q[0]),
             "down1": draw.dense(patch * q[0], q[1]),
             "middle": draw.block(q[1]),
             "down2": draw.dense(patch * q[1], q[2]),
@@ -158,10 +161,15 @@ def _spread(x: Float[Array, "b x y z c"]) -> Float[Array, "b 2*x 2*y 2*z c//8"]:
 # ------------------------------------------------------------------ networks
 
 
-def evidence_of(grids: Grids) -> Float[Array, "b x y z 2"]:
-    """Probabilities of measured surface and of free space."""
+def evidence_of(grids: Grids) -> Float[Array, "b x y z 4"]:
+    """Probabilities of measured surface and of free space, there and at the mirror image.
+
+    Many objects are symmetric. What was measured on one side of them is then known of the other,
+    and the network learns how far to believe it.
+    """
     F, M = (jnp.asarray(x).astype(jnp.float32) for x in grids[:2])
-    return jnp.stack([F * (1 - M), (1 - F) * (1 - M)], axis=-1)
+    here = jnp.stack([F * (1 - M), (1 - F) * (1 - M)], axis=-1)
+    return jnp.concatenate([here, jnp.flip(here, axis=1)], axis=-1)
 
 
 def skips(params: PyTree, grids: Grids, dtype: Any = jnp.float32) -> Skips:
