@@ -302,12 +302,12 @@ def test_other_weights_are_refused(chair, refused, tmp_path, prior):
         (("--code-noise", -1), "--code-noise is -1"),
         (("--code-weight", "inf"), "--code-weight is inf"),
         (("--report-every", 0), "--report-every is 0"),
-        (("--encoder", 4, 0, 8, 8), "--encoder is 4 0 8 8"),
+        (("--preset", "paper", "--encoder", 4, 0, 8, 8), "--encoder is 4 0 8 8"),
         (("--code", 1), "--code is 1"),
-        (("--max-views", 0), "--max-views is 0"),
+        (("--channels", 4, 0, 8), "--channels is 4 0 8"),
         (("--complete", 1.1), "--complete is 1.1"),
-        (("--scale", 1), "--scale is 1"),
-        (("--missing", -0.1), "--missing is -0.1"),
+        (("--warp", 1), "--warp is 1"),
+        (("--average", -0.1), "--average is -0.1"),
         (("--name", "a/b"), "--name is 'a/b'"),
         (("--meshes", "mugs"), "either --dataset FOLDER or --meshes FOLDER"),
         (("--start", "nowhere.safetensors"), "There is no weights file"),
@@ -329,7 +329,8 @@ def test_a_collection_of_meshes_that_cannot_be_trained_on_is_refused(chair, refu
 def test_a_missing_dataset_is_refused(refused, tmp_path):
     assert "There is no dataset" in refused("train", "--dataset", tmp_path / "nowhere")
     assert "--chairs is 0" in refused("dataset", "--chairs", 0)
-    assert "--views is 0" in refused("dataset", "--views", 0)
+    assert "--paths is 0" in refused("dataset", "--paths", 0)
+    assert "--missing is -0.1" in refused("dataset", "--missing", -0.1)
     assert "--noisy is 1.5" in refused("dataset", "--noisy", 1.5)
 
 
@@ -461,7 +462,7 @@ def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
 
 
 def test_a_preset_gives_the_defaults_of_the_other_options(monkeypatch):
-    assert preset_in(["train", "--preset=paper", "--front", "-y"]) == PRESETS["paper"]
+    assert preset_in(["train", "--preset=paper", "--front", "-y"]) == "paper"
     for preset, arguments, changed in (
         ("default", (), {}),
         ("paper", (), {}),
@@ -503,7 +504,7 @@ def test_machines_join_before_anything_is_read(run, monkeypatch, tmp_path, optio
 
 
 def test_only_the_first_process_speaks_and_writes(run, collection, tmp_path, monkeypatch, prior):
-    run("dataset", "--meshes", collection, "--views", 2, "--output", tmp_path / "data")
+    run("dataset", "--meshes", collection, "--paths", 2, "--output", tmp_path / "data")
     for index in (1, 0):
         monkeypatch.setattr(jax, "process_index", lambda index=index: index)
         arguments = ("train", "--dataset", tmp_path / "data", "--output", tmp_path / "out")
@@ -520,7 +521,8 @@ def test_only_the_first_process_speaks_and_writes(run, collection, tmp_path, mon
     assert status == 2 and "make it first with jaxshape dataset" in err
 
 
-TINY = ("--steps", 4, "--batch", 2, "--encoder", 4, 4, 8, 8, "--decoder", 8, 8, 4, "--code", 10)
+SIZES = ("--preset", "autoencoder", "--encoder", 4, 4, 8, 8, "--decoder", 8, 8, 4, "--code", 10)
+TINY = ("--steps", 4, "--batch", 2, *SIZES)
 
 
 @pytest.fixture
@@ -532,14 +534,15 @@ def collection(tmp_path, monkeypatch, prior):
         trimesh.creation.box((1, 2, 3 + i)).export(folder / f"box-{i}.ply")
     (folder / "empty.ply").write_bytes(b"")
 
-    def grids(mesh, config, seed):
+    def paths(mesh, config, seed):
         random = np.random.default_rng(seed)
-        return dataset.pack(random.random((1 + config.views, 32, 32, 32)) < 0.5)
+        surfaces = random.integers(0, 256, (config.paths, 4096), np.uint8)
+        return surfaces, np.zeros((config.paths, len(config.frames), 32**3), np.uint8)
 
     def train(folder, data, config, start=None):
         done = [report.step for report in training.read_metrics(folder)]
         for step in range(max(done, default=0) + 1, config.steps + 1):
-            report = training.Report(step, 0.1 * step, 0.5, 10.0, 2.0)
+            report = training.Report(step, 0.1 * step, 0.5, None, None, 10.0, 2.0)
             if jax.process_index() == 0:
                 training._record(folder, report)
             yield report
@@ -553,7 +556,7 @@ def collection(tmp_path, monkeypatch, prior):
             yield {"name": model.name, "metadata": {}, "frames": frames}
 
     monkeypatch.setattr(dataset, "ProcessPoolExecutor", lambda n, mp_context: ThreadPoolExecutor(n))
-    monkeypatch.setattr(dataset, "training_grids", grids)
+    monkeypatch.setattr(dataset, "object_paths", paths)
     monkeypatch.setattr(training, "train", train)
     monkeypatch.setattr(training, "finished_prior", lambda *_: prior)
     monkeypatch.setattr(evaluation, "evaluate", evaluate)
@@ -639,13 +642,13 @@ def test_training_goes_on_from_the_weights_of_another(
 @pytest.mark.slow
 def test_from_dataset_to_training_to_reconstruction(run, chair, tmp_path):
     data, trained = tmp_path / "data", tmp_path / "train"
-    make = ("dataset", "--chairs", 4, "--views", 2, "--workers", 1, "--output", data)
+    make = ("dataset", "--chairs", 4, "--frames", 1, 2, "--cameras", "paper", "--workers", 1,
+            "--output", data)  # fmt: skip
     learn = ("train", "--dataset", data, "--output", trained, "--steps", 2, "--batch", 2)
-    sizes = ("--encoder", 4, 4, 8, 8, "--decoder", 8, 8, 4, "--code", 10)
     few = ("--weights", trained / "weights.safetensors", "--iterations", 2)
     for command in (
         make,
-        (*learn, *sizes),
+        (*learn, *SIZES),
         ("evaluate", "--meshes", chair, "--frames", "1", "--output", tmp_path / "s.json", *few),
     ):
         status, _, err = run(*command)

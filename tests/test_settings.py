@@ -5,12 +5,12 @@ import math
 
 import pytest
 
-from jaxshape.data.config import DatasetConfig, InputConfig
+from jaxshape.data.config import DatasetConfig, FaultConfig, InputConfig
 from jaxshape.data.render import SensorNoise
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.placement.placing import PlacementConfig
 from jaxshape.mapping.segmentation.segment import Prompt
-from jaxshape.model.config import Architecture, TrainConfig
+from jaxshape.model.config import Architecture, Completion, TrainConfig
 
 SHARE = (-0.1, 1.5, math.nan)
 POSITIVE = (0.0, -1.0, math.inf, math.nan)
@@ -18,14 +18,18 @@ COUNT = (0, -1)
 SWITCH = ("yes",)
 
 WRONG = {
-    DatasetConfig: {"views": COUNT, "noisy": SHARE, "up": ("w", "+x"), "front": ("",),
+    FaultConfig: dict.fromkeys(("pose_error", "missing", "segmentation", "hidden", "loose"), SHARE),
+    DatasetConfig: {"paths": COUNT, "frames": ((), (2, 1), (0,)), "cameras": ((), ("polaroid",)),
+                    "noisy": SHARE, "arcs": SHARE, "up": ("w", "+x"), "front": ("",),
                     "resolution": (0, 33, 24), "seed": (-1,)},
     Architecture: {"encoder": ((), (4, 0, 8)), "decoder": ((0,),), "code": (*COUNT, 1)},
+    Completion: {"channels": ((4, 0, 8),), "depth": COUNT, "code": (*COUNT, 1),
+                 "resolution": (0, 12, 4)},
     TrainConfig: {"steps": COUNT, "batch": COUNT, "optimizer": ("sgd",), "learning_rate": POSITIVE,
-                  "schedule": ("linear",), "occupied_weight": POSITIVE, "code_noise": (-1.0,),
+                  "schedule": ("linear",), "occupied_weight": POSITIVE, "occluded_weight": POSITIVE,
+                  "average": SHARE, "validation": (-1,), "code_noise": (-1.0,),
                   "code_weight": (math.inf,), "report_every": COUNT, "seed": (-1,)},
-    InputConfig: {"max_views": COUNT, "complete": SHARE, "mirror": SWITCH, "scale": (*SHARE, 1.0),
-                  "pose_error": SHARE, "missing": SHARE, "segmentation": SHARE},
+    InputConfig: {"complete": SHARE, "mirror": SWITCH, "warp": (*SHARE, 1.0)},
     SensorNoise: {"axial": (-1e-3, math.inf), "lateral": (-0.1, math.nan),
                   "quantization": POSITIVE, "dropout": SHARE, "grazing": (-1.0, 181.0)},
     TrackingConfig: {"against": ("maps", "Map"), "on": ("objects",), "min_inliers": SHARE,

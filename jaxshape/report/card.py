@@ -15,7 +15,10 @@ import jax
 
 from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.model import weights
+from jaxshape.model.completion import COMPLETION
 from jaxshape.model.config import TrainConfig
+from jaxshape.model.families import family_of
+from jaxshape.model.pca import PCA
 from jaxshape.model.training import Report
 from jaxshape.process import processor
 
@@ -50,13 +53,15 @@ def training_card(
     """
     before = weights.load_card(start) if start else {}
     return basis_card(config, data, command=command, licence=licence) | {
-        "model": "autoencoder",
+        "model": family_of(config.architecture).model.kind,
         "config": asdict(config),
         "samples": config.steps * config.batch,
         "samples_before": before.get("samples", 0) + before.get("samples_before", 0),
         "start": weights.fingerprint(weights.load_prior(start)) if start else None,
         "training_loss": metrics[-1].loss,
         "training_iou": metrics[-1].iou,
+        "validation_iou": metrics[-1].validation_iou,
+        "validation_occluded": metrics[-1].validation_occluded,
         "training_seconds": round(sum(report.seconds for report in metrics)),
     }
 
@@ -132,6 +137,12 @@ def _model(card: dict[str, Any]) -> str:
     if card["model"] == "pca":
         return f"principal components {grids}"
     sizes = card["config"]["architecture"]
+    if card["model"] == COMPLETION.kind:
+        channels = _chain(sizes["channels"])
+        return (
+            f"a network conditioned on what was measured, {grids}, {channels} channels at a half, "
+            "a quarter\nand an eighth of the resolution"
+        )
     encoder, decoder = _chain(sizes["encoder"]), _chain([*sizes["decoder"], 1])
     return f"an auto-encoder {grids}, encoder {encoder}, decoder {decoder}"
 
@@ -146,12 +157,20 @@ def _facts(card: dict[str, Any]) -> dict[str, str]:
     facts = {
         "Data": f"{data['used']:,} objects of `{data['source']}`"
         + f" ({left_out} more could not be used)" * bool(left_out)
-        + f", {data['config']['views']} random views each, "
-        f"{data['config']['noisy']:.0%} of the objects with sensor noise",
+        + f", each filmed along {_paths(data['config'])}",
         "Licence": card["licence"],
         "Command": f"`{card['command']}`",
     }
-    return facts | (_run(card) if card["model"] == "autoencoder" else {})
+    return facts | ({} if card["model"] == PCA.kind else _run(card))
+
+
+def _paths(config: dict[str, Any]) -> str:
+    count = config["paths"]
+    frames = ", ".join(map(str, config["frames"]))
+    return (
+        f"{count} path{'s' * (count > 1)} by a camera ({', '.join(config['cameras'])}), "
+        f"{config['noisy']:.0%} with sensor noise; inputs are what {frames} frames measured"
+    )
 
 
 def _run(card: dict[str, Any]) -> dict[str, str]:
@@ -166,6 +185,11 @@ def _run(card: dict[str, Any]) -> dict[str, str]:
         "Last training loss": f"{card['training_loss']:.4f} nats per voxel, "
         f"IoU {card['training_iou']:.3f}",
     }
+    if card["validation_iou"] is not None:
+        facts["Objects kept out"] = (
+            f"IoU {card['validation_iou']:.3f} of the decoded first codes, "
+            f"{card['validation_occluded']:.3f} in occluded voxels"
+        )
     if card["start"]:
         before = f"after {card['samples_before']:,} samples"
         facts["Started from"] = f"weights with the fingerprint {card['start'][:16]}, {before}"

@@ -15,7 +15,8 @@ SCRIPT = Path(__file__).parents[2] / "experiments" / "training_choices.py"
 
 @pytest.mark.slow
 def test_smoke(tmp_path):
-    for _ in build_dataset(tmp_path / "data", range(12), DatasetConfig(views=2), workers=1):
+    settings = DatasetConfig(frames=(1, 2), cameras=("paper",))
+    for _ in build_dataset(tmp_path / "data", range(12), settings, workers=1):
         pass
     command = [sys.executable, SCRIPT, "--dataset", tmp_path / "data", "--output", tmp_path / "out",
                "--smoke"]  # fmt: skip

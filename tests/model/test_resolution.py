@@ -26,7 +26,14 @@ from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
 def test_a_network_of_another_resolution_trains_refines_and_meshes(tmp_path, encoder, decoder):
     sizes = Architecture(encoder, decoder, 8)
     n = sizes.resolution
-    list(build_dataset(tmp_path / "d", range(8), DatasetConfig(views=2, resolution=n), workers=1))
+    list(
+        build_dataset(
+            tmp_path / "d",
+            range(8),
+            DatasetConfig(frames=(1, 2), cameras=("paper",), resolution=n),
+            workers=1,
+        )
+    )
     dataset = open_dataset(tmp_path / "d")
     assert dataset.resolution == n
     config = TrainConfig(sizes, steps=30, batch=4, report_every=10)
@@ -49,7 +56,14 @@ def test_a_network_of_another_resolution_trains_refines_and_meshes(tmp_path, enc
 
 
 def test_a_dataset_of_another_resolution_is_refused(tmp_path):
-    list(build_dataset(tmp_path / "d", range(2), DatasetConfig(views=1, resolution=8), workers=1))
+    list(
+        build_dataset(
+            tmp_path / "d",
+            range(2),
+            DatasetConfig(frames=(1,), cameras=("paper",), resolution=8),
+            workers=1,
+        )
+    )
     dataset = open_dataset(tmp_path / "d")
     config = TrainConfig(Architecture((4, 4, 4), (4, 4), 4), steps=1, batch=1)
     with pytest.raises(ValueError, match=r"grids of 8\^3 voxels, and the network .* 16\^3"):

@@ -10,8 +10,9 @@ from jaxshape.model.training import Report
 from jaxshape.model.weights import fingerprint, load_prior, save_prior
 from jaxshape.report.card import COLUMNS, describe, hardware, rows_of, training_card
 
-DATA = {"config": {"views": 6, "noisy": 0.25}, "objects": 50, "used": 48, "source": "mugs/"}
-METRICS = [Report(3, 0.5, 0.1, 9.0, 20.4), Report(5, 0.25, 0.75, 9.0, 30.3)]
+PATHS = {"paths": 3, "frames": [1, 4], "cameras": ["paper", "kinect"], "noisy": 0.25}
+DATA = {"config": PATHS, "objects": 50, "used": 48, "source": "mugs/"}
+METRICS = [Report(3, 0.5, 0.1, None, None, 9.0, 20.4), Report(5, 0.25, 0.75, 0.6, 0.4, 9.0, 30.3)]
 SCORES = dict(iou=0.1, iou_composed=0.2, chamfer_l1=0.01234, f_score=0.4, objective=0.5)
 MEANS = {"4": {"cma": SCORES, "bounds": {"occluded_empty": 0.6, "occluded_full": 0.7}}}
 EVALUATED = {"config": {"refine": {"iterations": 50}}, "per_mesh": [{}] * 5, "means": MEANS}
@@ -31,7 +32,10 @@ def test_a_card_tells_what_was_done():
     text = describe("mug", card, EVALUATED)
     for said in (
         "mug.safetensors",
-        "48 objects of `mugs/` (2 more could not be used), 6 random views each, 25% of",
+        "48 objects of `mugs/` (2 more could not be used), each filmed along 3 paths by a camera",
+        "(paper, kinect), 25% with sensor noise; inputs are what 1, 4 frames measured",
+        "conditioned on what was measured",
+        "IoU 0.600 of the decoded first codes, 0.400 in occluded voxels",
         "| Licence | CC0 |",
         "`jaxshape train ...`",
         "10 samples, 5 steps of 2",
