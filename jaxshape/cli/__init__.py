@@ -38,7 +38,7 @@ from jaxshape.process import prepare_process
 def commands(arguments: Sequence[str]) -> Any:
     """The table of commands; --preset decides the defaults of `dataset` and `train`."""
     preset = preset_in(arguments)
-    dataset = BuildDataset(tyro.MISSING, config=DATASETS.get(preset, DATASETS["default"]))
+    dataset = BuildDataset(config=DATASETS.get(preset, DATASETS["default"]))
     train = Train(config=PRESETS[preset])
     return (
         Annotated[Demo, subcommand("demo")]

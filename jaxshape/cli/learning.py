@@ -40,8 +40,9 @@ class BuildDataset:
     jaxshape dataset --output data/paper --preset paper
     """
 
-    output: Path
-    """Folder of the dataset; a build that was killed goes on when asked for again."""
+    output: Path | None = None
+    """Folder of the dataset; data/chairs, or data/NAME of --meshes NAME, where not given. A build
+    that was killed goes on when asked for again."""
     chairs: int = 8000
     """Procedural chairs to make, unless --meshes is given."""
     meshes: Path | None = None
@@ -60,7 +61,8 @@ class BuildDataset:
         require(1 <= self.chairs <= TEST_SEEDS, f"--chairs is {self.chairs}; give 1 to 1000000.")
         require(self.workers >= 1, f"--workers is {self.workers}; give 1 or more.")
         objects: Sequence[Any] = list_meshes(self.meshes) if self.meshes else range(self.chairs)
-        build(self.output, objects, self.config, self.workers)
+        output = self.output or Path("data") / (self.meshes.stem if self.meshes else "chairs")
+        build(output, objects, self.config, self.workers)
 
 
 def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: int) -> None:

@@ -110,8 +110,8 @@ class TrainConfig:
             network's codes, and of half the squared length, in nats, of an auto-encoder's, which
             with noise of 1 is the divergence of a posterior of variance 1.
         bfloat16: Compute convolutions in bfloat16; parameters, statistics and Adam stay in float32.
-        validation: Objects at the end of the dataset that are kept out of training and completed
-            for each report, 0 or more; at most a tenth of the dataset.
+        validation: How many of the dataset's last objects are kept out of training and completed
+            for each report, 0 or more; at most a tenth of them.
         report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
             on from the last checkpoint.
         seed: Seed of the first weights and of the batches, 0 or more.
