@@ -123,7 +123,8 @@ def along(method: str, how: RefineConfig, prior: ShapePrior, config: Config) -> 
     often, seldom = (jnp.array(sampled(config, n)) - 1 for n in (30, 12))
 
     def contest(keys: Array, prior: ShapePrior, case: Case) -> Scores:
-        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, how)
+        F, M = case.grids.occupied, case.grids.occluded
+        found = reconstruct(keys, prior, F, M, refiner, how)
         assert found.trace is not None and found.path is not None and found.iterations is not None
         drawn = found.trace.loss
         return {

@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.config import DatasetConfig, InputConfig
 from jaxshape.data.render import SensorNoise
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
@@ -28,6 +29,7 @@ WRONG = {
                   "pose_error": SHARE, "missing": SHARE, "segmentation": SHARE},
     SensorNoise: {"axial": (-1e-3, math.inf), "lateral": (-0.1, math.nan),
                   "quantization": POSITIVE, "dropout": SHARE, "grazing": (-1.0, 181.0)},
+    CameraConfig: {"camera": ("Kinect", ""), "noise": SWITCH, "fusion": ("tsdf",)},
     TrackingConfig: {"against": ("maps", "Map"), "on": ("objects",), "min_inliers": SHARE,
                      "sure_inliers": SHARE, "min_overlap": SHARE, "max_angle": POSITIVE,
                      "max_distance": POSITIVE},

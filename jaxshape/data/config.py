@@ -8,6 +8,9 @@ from typing import Literal, get_args
 
 from jaxshape import checks
 
+CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]
+"""Depth cameras that a virtual one can stand for (`data/virtual_cameras`)."""
+
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 

@@ -1,9 +1,9 @@
 """Depth cameras that a virtual one can stand for."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from jaxshape import checks
+from jaxshape.data.config import CameraName
 from jaxshape.geometry import sensor
 
 
@@ -72,8 +72,6 @@ class VirtualCamera:
         if not self.distance > 0.5:
             checks.refuse("distance", self.distance, "more than 0.5 diagonals, outside the object")
 
-
-CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]
 
 CAMERAS: dict[CameraName, VirtualCamera] = {
     # The paper does not give the size of its images.

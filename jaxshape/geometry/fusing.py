@@ -9,23 +9,24 @@ distances on a fine grid, for depth that is real or noisy. Both are static under
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from itertools import pairwise
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxshape import checks
 from jaxshape.geometry import distance, fusion
 from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.config import FusionName
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.evidence import soft_grids
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import RESOLUTION, GridFrame
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
-
-FusionName = Literal["distance", "points"]
 
 
 @jax.tree_util.register_static
@@ -144,6 +145,7 @@ def fuse(
     T_object_camera: jaxlie.SE3,
     frame: GridFrame,
     sensor: Sensor = Sensor(),
+    state: Any = None,
 ) -> Any:
     """The state of all frames of one camera, added one at a time so that memory holds two fields.
 
@@ -164,4 +166,39 @@ def fuse(
         new = fusing.measure(depth, segmented, intrinsics, T, frame, sensor)
         return merge(state, new), None
 
-    return jax.lax.scan(add, fusing.nothing(), (depth, segmented, T_object_camera))[0]
+    earlier = fusing.nothing() if state is None else state
+    return jax.lax.scan(add, earlier, (depth, segmented, T_object_camera))[0]
+
+
+def fuse_cumulative(
+    fusing: Fusion,
+    numbers: tuple[int, ...],
+    depth: Float[Array, "frame h w"],
+    segmented: Bool[Array, "frame h w"],
+    intrinsics: Intrinsics,
+    T_object_camera: jaxlie.SE3,
+    frame: GridFrame,
+    sensor: Sensor = Sensor(),
+) -> Grids:
+    """F and M of the first k frames, for each k of an increasing tuple.
+
+    Args:
+        fusing: The way to fuse them.
+        numbers: Increasing numbers of frames, 1 or more each.
+        depth: Metres `[frame h w]`; 0 where nothing is known, infinite where the ray met nothing.
+        segmented: True on pixels that show the object `[frame h w]`.
+        intrinsics: The camera of all frames.
+        T_object_camera: Pose of each frame in the object frame `[frame]`.
+        frame: Voxel frame of F and M.
+        sensor: How the camera's noise grows.
+
+    Returns:
+        Grids `[len(numbers) x y z]`.
+    """
+    frames = depth, segmented, T_object_camera
+    state, found = fusing.nothing(), []
+    for ends in pairwise((0, *numbers)):
+        depth, segmented, T = jax.tree.map(lambda x, ends=ends: x[slice(*ends)], frames)
+        state = fuse(fusing, depth, segmented, intrinsics, T, frame, sensor, state)
+        found.append(fusing.grids(state))
+    return jax.tree.map(lambda *x: jnp.stack(x), *found)
