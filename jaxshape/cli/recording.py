@@ -95,9 +95,7 @@ class Reconstruct(Rebuild):
         }
         earlier = None
         if not self.fresh:
-            earlier = load_state(
-                self.output, sequence, prior, settings, isotropic=self.mapping.isotropic
-            )
+            earlier = load_state(self.output, sequence, prior, settings, self.mapping)
         if earlier is None:
             with console.status("finding the object"):
                 found = find_start(
@@ -133,19 +131,16 @@ class Reconstruct(Rebuild):
                 if time.perf_counter() - written > _SECONDS_BETWEEN_WRITES:
                     seconds = {"seconds": round(time.perf_counter() - start, 2)}
                     write_progress(
-                        self.output, sequence, progress, figures | seconds, self.mapping.min_hits,
-                        running=True,
-                    )  # fmt: skip
+                        self.output, sequence, progress, figures | seconds, running=True
+                    )
                     written = time.perf_counter()
         assert progress is not None  # there is at least the first frame
         with console.status("searching the space of shapes"):
             state, shape = mapper.finish(progress.state)
         progress = progress._replace(state=state, shape=shape)
-        require_measured(observation_of(state, self.mapping.min_hits).occupied)
+        require_measured(observation_of(state).occupied)
         figures["seconds"] = round(time.perf_counter() - start, 2)
-        result = write_progress(
-            self.output, sequence, progress, figures, self.mapping.min_hits, running=False
-        )
+        result = write_progress(self.output, sequence, progress, figures, running=False)
         self._conclude(progress, result)
         remove_state(self.output)
 
@@ -173,7 +168,7 @@ class Reconstruct(Rebuild):
         from jaxshape.report.panels import write_overview
         from jaxshape.results.progress import observation_of
 
-        observation = observation_of(progress.state, self.mapping.min_hits)
+        observation = observation_of(progress.state)
         with console.status("drawing"):
             write_overview(self.output, observation, progress.shape, result)
             write_report(self.output)

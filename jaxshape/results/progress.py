@@ -19,9 +19,9 @@ from PIL import Image
 
 from jaxshape.data.sequences import Sequence, Trajectory, write_trajectory
 from jaxshape.files import atomic_path, write_json
-from jaxshape.geometry import fusion
+from jaxshape.geometry.grids import binary
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
-from jaxshape.mapping.map.state import MapState
+from jaxshape.mapping.map.state import MapState, grids_of
 from jaxshape.mapping.tracking.keyframes import Keyframe
 from jaxshape.results.output import Observation, write_shape
 
@@ -33,7 +33,6 @@ def write_progress(
     sequence: Sequence,
     progress: Progress,
     figures: dict[str, Any],
-    min_hits: int,
     *,
     running: bool,
 ) -> dict[str, Any]:
@@ -44,7 +43,6 @@ def write_progress(
         sequence: The recording.
         progress: Progress of the run.
         figures: Further entries of `result.json`.
-        min_hits: Depth points that make a voxel occupied.
         running: Whether the run goes on.
 
     Returns:
@@ -52,7 +50,7 @@ def write_progress(
     """
     _write_pictures(folder / "keyframes", sequence, progress)
     _write_trajectory(folder, sequence, progress)
-    observation = observation_of(progress.state, min_hits)
+    observation = observation_of(progress.state)
     start = progress.start
     result = {**figures, **counts(progress), "notes": start.notes, "warnings": start.warnings}
     result["box"] = {
@@ -68,14 +66,15 @@ def write_progress(
     return result
 
 
-def observation_of(state: MapState, min_hits: int) -> Observation:
+def observation_of(state: MapState) -> Observation:
     """Measurement of the object by the keyframes of a map."""
+    grids = binary(grids_of(state))
     every = max(1, len(state.keyframes) // FRAMES_TO_SHOW)
     shown = state.keyframes[::every][:FRAMES_TO_SHOW]
     return Observation(
         depth=[_crop(np.asarray(one.depth), np.asarray(one.segmented)) for one in shown],
-        occupied=np.asarray(fusion.occupied(state.measurement, min_hits)),
-        occluded=np.asarray(fusion.occluded(state.measurement, min_hits)),
+        occupied=np.asarray(grids.occupied),
+        occluded=np.asarray(grids.occluded),
         frame=state.place.frame,
         T_world_object=state.place.box.T_world_object,
         truth=None,

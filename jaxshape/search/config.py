@@ -11,6 +11,15 @@ ObjectiveName = Literal["balanced", "paper", "soft"]
 Space = Literal["whitened", "raw"]
 
 
+def objective_for(fusion: str) -> ObjectiveName:
+    """The objective that suits the grids of a way to fuse frames.
+
+    Args:
+        fusion: "distance", whose F and M are soft, or "points", whose F and M are binary.
+    """
+    return "soft" if fusion == "distance" else "balanced"
+
+
 def is_array(value: Any) -> bool:
     """Whether a setting is a JAX array, which may be traced, so that its value is not known."""
     return hasattr(value, "aval")
@@ -23,7 +32,8 @@ class RefineConfig:
     Attributes:
         objective: The residual that is minimised: `paper` is Eq. 7 as printed; in `balanced`
             measured free space counts a third; in `soft` each voxel counts by how sure its
-            measurement is.
+            measurement is. None for `soft` where F and M are soft, as signed distances give them,
+            and `balanced` where they are binary.
         iterations: Steps of the search at most, 1 or more (paper: 350).
         population: Candidates per iteration of a population search, 3 or more (pycma's default for
             100 dimensions is 17).
@@ -48,7 +58,7 @@ class RefineConfig:
             checked.
     """
 
-    objective: ObjectiveName = "balanced"
+    objective: ObjectiveName | None = None
     iterations: int = 350
     population: int = 17
     sigma0: float = 0.1
@@ -61,7 +71,8 @@ class RefineConfig:
     precision: Precision = "float32"
 
     def __post_init__(self) -> None:
-        one_of("objective", self.objective, get_args(ObjectiveName))
+        if self.objective is not None:
+            one_of("objective", self.objective, get_args(ObjectiveName))
         one_of("space", self.space, get_args(Space))
         one_of("precision", self.precision, get_args(Precision))
         whole("iterations", self.iterations, 1)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.shapes import ShapePrior, decode, encode
-from jaxshape.search.config import RefineConfig
+from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty
 from jaxshape.search.refiner import Refiner, Trace
@@ -94,6 +94,12 @@ def search_space(prior: ShapePrior, config: RefineConfig) -> LatentSpace:
     return {"whitened": whitened, "raw": raw}[config.space](prior, config.bound)
 
 
+def residual_for(grids: Grids, config: RefineConfig) -> Residual:
+    """The residual that the settings name, or else the one that suits F and M."""
+    is_soft = jnp.issubdtype(jnp.result_type(grids.occupied), jnp.floating)
+    return RESIDUALS[config.objective or objective_for("distance" if is_soft else "points")]
+
+
 def code_penalty(prior: ShapePrior, weight: float) -> Penalty | None:
     """The cost of a code for its distance from the codes of the training set.
 
@@ -146,7 +152,7 @@ def reconstruct(
     """
     grids = Grids(occupied, occluded, data)
     require_batch(grids)
-    residual = RESIDUALS[config.objective] if residual is None else residual
+    residual = residual_for(grids, config) if residual is None else residual
     first_code = encode(prior, grids)
     first_logits = decode(prior, first_code, grids)
     targets = jax.vmap(residual.target)(grids, first_logits)
