@@ -4,7 +4,7 @@
     keyframes.json   the camera, the keyframes and what became of every frame
     trajectory.txt   T_world_camera of the frames: TUM's format
     trajectory.log   the same, Open3D's
-    mesh.glb, mesh.ply, grid.npz, trace.npz, result.json: see `output`
+    mesh.ply, mesh.glb, grid.npz, trace.npz, result.json: see `output`
     state.npz        until the run ends: see `checkpoint`
 
 Every file is replaced at once, when the new one is whole, so that `jaxshape view` can watch.
@@ -19,10 +19,12 @@ from PIL import Image
 
 from jaxshape.data.sequences import Sequence, Trajectory, write_trajectory
 from jaxshape.files import atomic_path, write_json
+from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grids import binary
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.map.state import MapState, grids_of
 from jaxshape.mapping.tracking.keyframes import Keyframe
+from jaxshape.results.coloring import ColorView
 from jaxshape.results.output import Observation, write_shape
 
 FRAMES_TO_SHOW = 6
@@ -51,6 +53,8 @@ def write_progress(
     _write_pictures(folder / "keyframes", sequence, progress)
     _write_trajectory(folder, sequence, progress)
     observation = observation_of(progress.state)
+    if observation.field is not None:
+        observation = observation._replace(views=color_views(sequence, progress))
     start = progress.start
     result = {**figures, **counts(progress), "notes": start.notes, "warnings": start.warnings}
     result["box"] = {
@@ -78,7 +82,21 @@ def observation_of(state: MapState) -> Observation:
         frame=state.place.frame,
         T_world_object=state.place.box.T_world_object,
         truth=None,
+        field=state.measurement if isinstance(state.measurement, DistanceField) else None,
+        sensor=state.fusing.sensor,
     )
+
+
+def color_views(sequence: Sequence, progress: Progress) -> Iterator[ColorView]:
+    """The keyframes that have colours, at their present poses, read one after the other."""
+    T_object_world = np.linalg.inv(progress.state.place.box.T_world_object)
+    K = sequence.intrinsics
+    intrinsics = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    for log, keyframe in _fused(progress):
+        frame = sequence[log.index]
+        if frame.color is not None:
+            T_world_camera = np.asarray(keyframe.T_world_camera.as_matrix(), np.float64)
+            yield ColorView(frame.color, frame.depth, intrinsics, T_object_world @ T_world_camera)
 
 
 def counts(progress: Progress) -> dict[str, int]:
