@@ -43,8 +43,8 @@ class Seen:
     """Leave these faults out, as is done anyway for the paper's camera."""
     fusion: FusionName | None = None
     """How frames become F and M: `distance` averages signed distances on a fine grid, `points`
-    counts points in voxels (paper). None for points where the paper's camera has no noise, distances
-    elsewhere."""
+    counts points in voxels (paper). None for points where the paper's camera has no noise, else
+    for distances."""
 
     def config(self) -> CameraConfig:
         """The settings, checked."""

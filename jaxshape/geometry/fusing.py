@@ -8,6 +8,7 @@ distances on a fine grid, for depth that is real or noisy. Both are static under
     grids = fusing.grids(state)
 """
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -77,8 +78,8 @@ class Distances:
 
     Attributes:
         resolution: Voxels along each axis of F and M.
-        fine: Voxels along each axis of the fine grid, a multiple of the resolution; None for 4
-            times 32 (or the resolution, where that is more).
+        fine: Voxels along each axis of the fine grid, a multiple of the resolution; None for the
+            least multiple that is 4 times 32 or more.
 
     Raises:
         ValueError: The fine grid is not a multiple of the other.
@@ -94,7 +95,9 @@ class Distances:
 
     @property
     def _side(self) -> int:
-        return self.fine or max(self.resolution, distance.FINE * RESOLUTION)
+        if self.fine is not None:
+            return self.fine
+        return self.resolution * math.ceil(distance.FINE * RESOLUTION / self.resolution)
 
     def nothing(self) -> DistanceField:
         """The field of no frames."""

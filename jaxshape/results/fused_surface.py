@@ -5,6 +5,7 @@ measured, decoded logits stand for a distance. From the edge of what was measure
 carried on, and fades out over a voxel and a half, so that both surfaces meet without a step.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from skimage.measure import label, marching_cubes
 
 from jaxshape.geometry import evidence
 from jaxshape.geometry.distance import DistanceField, mean_distance
-from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.geometry.grid import GridFrame
 
 REACH = 1.5
 """Voxels over which measured distances fade out beyond the edge of what was measured."""
@@ -63,8 +64,8 @@ def fuse_surface(
     """The measured surface, completed by the decoded shape where nothing was measured.
 
     Args:
-        field: Of one object.
-        logits: Its decoded shape, 32 voxels along each side.
+        field: Of one object, on a grid whose side is a multiple of that of the logits.
+        logits: Its decoded shape.
         frame: Of the decoded grid, in the object frame.
 
     Returns:
@@ -74,7 +75,7 @@ def fuse_surface(
         ValueError: Where neither a surface was measured nor a shape decoded.
     """
     fine = field.weight.shape[-1]
-    scale = RESOLUTION / fine * np.asarray(frame.voxel_size, np.float64)
+    scale = logits.shape[-1] / fine * np.asarray(frame.voxel_size, np.float64)
     distance, measured = combine(field, np.asarray(logits), float(scale.max()))
     if not (distance < 0).any():
         raise ValueError(
@@ -106,13 +107,14 @@ def combine(
     Returns:
         Distances at the centres of fine voxels, and True next to the measured surface.
     """
-    measured, trusted, free, seen_free = jax.device_get(_measured(field))
+    resolution = len(logits)
+    measured, trusted, free, seen_free = jax.device_get(_measured(field, resolution))
     measured = measured / voxel
     trusted = trusted & (measured > -DEEP)
-    decoded = _decoded(logits, seen_free, len(measured) // RESOLUTION)
+    decoded = _decoded(logits, seen_free, len(measured) // resolution)
     if not trusted.any():
         return decoded, trusted
-    distance = _carried_on(measured, trusted, decoded)
+    distance = _carried_on(measured, trusted, decoded, REACH * len(measured) / resolution)
     # Free space is smoothed as a whole, so that single rays leave neither holes nor spikes.
     passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
     distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), FAR * (2 * passed - 1))
@@ -122,9 +124,9 @@ def combine(
     return _filled(distance, free), trusted & (np.abs(measured) < NEAR)
 
 
-@jax.jit
-def _measured(field: DistanceField) -> tuple[Array, Array, Array, Array]:
-    free = evidence.evidence(field).free
+@partial(jax.jit, static_argnums=1)
+def _measured(field: DistanceField, resolution: int) -> tuple[Array, Array, Array, Array]:
+    free = evidence.evidence(field, resolution).free
     return mean_distance(field), evidence.is_trusted(field), field.free > 0.5, free
 
 
@@ -141,13 +143,14 @@ def _carried_on(
     measured: Float[np.ndarray, "X Y Z"],
     trusted: Bool[np.ndarray, "X Y Z"],
     decoded: Float[np.ndarray, "X Y Z"],
+    reach: float,
 ) -> Float[np.ndarray, "X Y Z"]:
     """Measured distances that fade into decoded ones beyond the edge of what was measured."""
     nearest = np.asarray(
         ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     )
     away = np.sqrt(((nearest - np.indices(trusted.shape, np.int32)) ** 2).sum(axis=0))
-    share = np.clip(1 - away / (REACH * len(trusted) / RESOLUTION), 0, 1)
+    share = np.clip(1 - away / reach, 0, 1)
     return share * measured[tuple(nearest)].clip(-FAR, FAR) + (1 - share) * decoded
 
 
