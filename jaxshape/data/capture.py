@@ -3,7 +3,7 @@
 import math
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -172,6 +172,21 @@ def fused_grids(
         captured.frame,
         sensor,
     )
+
+
+@partial(jax.jit, static_argnames=("fusing", "sensor"))
+def fused_frames(captured: Capture, fusing: Fusion, sensor: Sensor = Sensor()) -> tuple[Any, Grids]:
+    """All frames of a capture as one state, and its F and M. Compiled by `jax.jit`.
+
+    Args:
+        captured: Depth frames of an object, from `capture`.
+        fusing: The way to fuse them.
+        sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
+    """
+    depth = jnp.asarray(captured.depth)
+    seen, T = jnp.isfinite(depth), captured.T_object_camera
+    state = fuse(fusing, depth, seen, captured.intrinsics, T, captured.frame, sensor)
+    return state, fusing.grids(state)
 
 
 def fuse_frames(

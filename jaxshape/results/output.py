@@ -70,7 +70,9 @@ def write_result(
     Returns:
         The content of `result.json`: `figures`, the objective before and after in nats per voxel,
         what the search took and why it stopped, the share of the mesh's area that was measured and
-        the number of loose pieces that were left out, and the IoUs where the truth is known.
+        the number of loose pieces that were left out, whether what is hidden was filled from its
+        mirror image and the share of the measured halves that agrees, and the IoUs where the truth
+        is known.
 
     Raises:
         ValueError: Where the shape is empty; nothing is written.
@@ -94,7 +96,7 @@ def write_shape(
     alone.
     """
     one = only(reconstruction)
-    found = shape_mesh(observation, one.composed, one.logits)
+    found = shape_mesh(observation, one.composed, one.fill_logits)
     told = {"measured": found.measured, "color": found.color}
     write_mesh(found.mesh, folder / "mesh.glb", **told)
     world = found.mesh.copy().apply_transform(observation.T_world_object)
@@ -134,7 +136,7 @@ def shape_mesh(
     Args:
         observation: Measurement of the object.
         composed: The composed grid, which makes the mesh where there are no signed distances.
-        logits: Logits of the decoded shape.
+        logits: Logits of the shape that fills what was not measured.
 
     Raises:
         ValueError: The shape is empty.
@@ -180,6 +182,9 @@ def _measured(observation: Observation, one: Any) -> dict[str, Any]:
         "voxels_measured": int(observation.occupied.sum()),
         "voxels_occluded": int(observation.occluded.sum()),
     }
+    if one.symmetric is not None:
+        measured["symmetric"] = bool(one.symmetric)
+        measured["symmetry_agreement"] = round(float(one.agreement), 4)
     if observation.truth is not None:
         measured |= {
             "iou_encoder": float(iou(one.completed_first, observation.truth)),
