@@ -166,9 +166,12 @@ def score(
 def _print_table(means: dict[str, Any], count: int) -> None:
     from jaxshape.report.card import COLUMNS, rows_of
 
-    table = Table(title=f"means over {count} meshes", title_justify="left")
+    title, padding = f"means over {count} meshes", (0, 1, 0, 0)  # 80 columns hold the table
+    table = Table(title=title, title_justify="left", box=None, padding=padding, pad_edge=False)
     for column in COLUMNS:
-        table.add_column(column, justify="left" if column == "method" else "right")
+        named = column == "method"
+        header = column.replace("-L1", "-\nL1")
+        table.add_column(header, justify="left" if named else "right", no_wrap=named)
     for row in rows_of(means):
         table.add_row(*row)
     Console().print(table)

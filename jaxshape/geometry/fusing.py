@@ -160,6 +160,7 @@ def fuse(
         T_object_camera: Pose of each frame in the object frame `[frame]`.
         frame: Voxel frame of F and M.
         sensor: How the camera's noise grows.
+        state: The state of earlier frames; None where there are none.
     """
 
     merge: Any = fusing.merge  # of either kind, and so is the state
