@@ -408,7 +408,7 @@ def plot(journal: Journal, config: Config) -> None:
 def panels(row: Rows, prior: ShapePrior, config: Config) -> Iterator[Any]:
     """Truth, F and every search's shape, its IoU below."""
     chair = next(one for one in subjects(config.test) if one.name == row["name"])
-    occupied, occluded, surface = (np.asarray(x) for x in seen(chair, row["frames"]))
+    (occupied, occluded, _), surface = jax.device_get(seen(chair, row["frames"]))
     codes = jnp.array([row["code"][name] for name in SHAPES])
     shapes = np.asarray(decode(prior, codes) > 0)
     yield grid_panel("truth", surface, "truth", note=row["group"])
