@@ -41,8 +41,9 @@ DEEP = 1.5
 FAR, NEAR = 3.0, 0.5
 """Fine voxels at which distances end, and within which a vertex lies on the measured surface."""
 
-LITTLE = 0.03
-"""Weight at which a measured distance and the smooth surface around it count the same."""
+LITTLE, LESS, AROUND = 0.03, 0.25, 7
+"""Weight at which a measured distance and the smooth surface around it count the same, and as a
+share of the greatest weight among so many fine voxels: edges are ragged where few frames agree."""
 
 CRUMB = 0.01
 """Share of the largest piece's area below which a loose piece is dropped wherever it lies."""
@@ -83,7 +84,7 @@ def fuse_surface(
     """
     fine = field.weight.shape[-1]
     scale = logits.shape[-1] / fine * np.asarray(frame.voxel_size, np.float64)
-    distance, measured = combine(field, np.asarray(logits), float(scale.max()))
+    distance, seen = combine(field, np.asarray(logits), float(scale.max()))
     if not (distance < 0).any():
         raise ValueError(
             "There is no surface: nothing was measured inside the box and no logit is above "
@@ -92,14 +93,15 @@ def fuse_surface(
     padded = np.pad(distance, 1, constant_values=max(distance.max(), 1e-3))  # closed at the border
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent")
     vertices -= 0.5  # of the padded grid, whose first centre is at -0.5
-    away = ndimage.map_coordinates(measured, (vertices - 0.5).T, order=1, mode="nearest")
+    away = ndimage.map_coordinates(seen, (vertices - 0.5).T, order=1, mode="nearest")
     mesh = trimesh.Trimesh(
         np.asarray(frame.origin, np.float64) + vertices * scale, faces, process=False
     )
     if mesh.volume < 0:
         mesh.invert()
     trimesh.smoothing.filter_taubin(mesh, lamb=0.5, nu=0.525, iterations=ROUNDS)
-    return _without_loose_pieces(mesh, np.abs(away) < NEAR, float(frame.voxel_size[1]))
+    measured = _settled(mesh, np.abs(away) < NEAR)
+    return _without_loose_pieces(mesh, measured, float(frame.voxel_size[1]))
 
 
 def combine(
@@ -127,7 +129,8 @@ def combine(
     passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
     distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), FAR * (2 * passed - 1))
     weight = np.where(trusted, np.asarray(field.weight), 0)
-    certainty = weight**2 / (weight**2 + LITTLE**2)
+    little = np.maximum(LITTLE, LESS * ndimage.maximum_filter(weight, AROUND))
+    certainty = weight**2 / (weight**2 + little**2)
     distance = certainty * measured + (1 - certainty) * distance
     return _filled(distance, free), np.where(trusted, measured, FAR).clip(-FAR, FAR)
 
@@ -185,6 +188,18 @@ def _filled(
     seen[labels[0, 0, 0]] = True
     cavity = (labels > 0) & ~seen[labels]
     return np.where(cavity[1:-1, 1:-1, 1:-1], -1.0, distance)
+
+
+def _settled(
+    mesh: trimesh.Trimesh, measured: Bool[np.ndarray, " n"], rounds: int = 4
+) -> Bool[np.ndarray, " n"]:
+    """The flags of most of each vertex and its neighbours: no speckles across a border."""
+    one, other = mesh.edges.T
+    count = np.bincount(one, minlength=len(measured)) + 1
+    for _ in range(rounds):
+        votes = measured + np.bincount(one, weights=measured[other], minlength=len(measured))
+        measured = 2 * votes > count
+    return measured
 
 
 def _without_loose_pieces(
