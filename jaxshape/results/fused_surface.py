@@ -120,11 +120,12 @@ def combine(
     resolution = len(logits)
     measured, trusted, free, seen_free = jax.device_get(_measured(field, resolution))
     measured = measured / voxel
-    trusted = trusted & (measured > -DEEP)
-    decoded = _decoded(logits, seen_free, len(measured) // resolution)
+    scale = len(measured) // resolution
+    trusted = _within_margin(trusted & (measured > -DEEP), 3 * scale // 4)
+    decoded = _decoded(logits, seen_free, scale)
     if not trusted.any():
         return decoded, np.full_like(decoded, FAR)
-    distance = _carried_on(measured, trusted, decoded, len(measured) // resolution)
+    distance = _carried_on(measured, trusted, decoded, scale)
     # Free space is smoothed as a whole, so that single rays leave neither holes nor spikes.
     passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
     distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), FAR * (2 * passed - 1))
@@ -139,6 +140,14 @@ def combine(
 def _measured(field: DistanceField, resolution: int) -> tuple[Array, Array, Array, Array]:
     free = evidence.evidence(field, resolution).free
     return mean_distance(field), evidence.is_trusted(field), field.free > 0.5, free
+
+
+def _within_margin(trusted: Bool[np.ndarray, "X Y Z"], width: int) -> Bool[np.ndarray, "X Y Z"]:
+    """Nothing is trusted in the margin that the box leaves free, where only the floor is seen."""
+    inner = slice(width, len(trusted) - width)
+    kept = np.zeros_like(trusted)
+    kept[inner, inner, inner] = trusted[inner, inner, inner]
+    return kept
 
 
 def _decoded(
