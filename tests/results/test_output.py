@@ -76,7 +76,7 @@ def test_the_encoder_alone_leaves_no_trace_of_an_earlier_search(tmp_path):
 
 
 def test_the_mesh_is_closed_and_lies_in_the_world(written):
-    mesh = trimesh.load_mesh(written[0] / "mesh.glb")
+    mesh = trimesh.load_mesh(written[0] / "mesh.ply")
     assert mesh.is_watertight and mesh.volume > 0
     # Voxels 4 to 20, 28 and 28, in metres, carried to the world.
     corners = np.array([[4, 4, 4], [20, 28, 28]]) * [0.02, 0.04, 0.02] - [0.32, 0.64, 0.32]
