@@ -2,7 +2,7 @@
 
 The measured surface is where the fused signed distance changes its sign. Where nothing was
 measured, decoded logits stand for a distance. From the edge of what was measured its distance is
-carried on, and fades out over a voxel and a half, so that both surfaces meet without a step; much
+carried on, and fades out over six fine voxels, so that both surfaces meet without a step; much
 sooner where it would go on as a fin into what the decoded shape leaves free.
 """
 
@@ -20,8 +20,8 @@ from jaxshape.geometry import evidence
 from jaxshape.geometry.distance import DistanceField, mean_distance
 from jaxshape.geometry.grid import GridFrame
 
-REACH, FIN = 1.5, 0.4
-"""Voxels over which measured distances fade out beyond the edge of what was measured, and where
+REACH, FIN = 6.0, 1.6
+"""Fine voxels over which measured distances fade out beyond the edge of what was measured, and where
 they are solid and the decoded shape is free."""
 
 ROUNDS = 10
@@ -125,7 +125,7 @@ def combine(
     decoded = _decoded(logits, seen_free, scale)
     if not trusted.any():
         return decoded, np.full_like(decoded, FAR)
-    distance = _carried_on(measured, trusted, decoded, scale)
+    distance = _carried_on(measured, trusted, decoded)
     # Free space is smoothed as a whole, so that single rays leave neither holes nor spikes.
     passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
     distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), FAR * (2 * passed - 1))
@@ -163,7 +163,6 @@ def _carried_on(
     measured: Float[np.ndarray, "X Y Z"],
     trusted: Bool[np.ndarray, "X Y Z"],
     decoded: Float[np.ndarray, "X Y Z"],
-    scale: int,
 ) -> Float[np.ndarray, "X Y Z"]:
     """Measured distances that fade into decoded ones beyond the edge of what was measured."""
     nearest = np.asarray(
@@ -171,7 +170,7 @@ def _carried_on(
     )
     away = np.sqrt(((nearest - np.indices(trusted.shape, np.int32)) ** 2).sum(axis=0))
     carried = measured[tuple(nearest)].clip(-FAR, FAR)
-    reach = scale * np.where((carried < 0) & (decoded > 0), FIN, REACH)
+    reach = np.where((carried < 0) & (decoded > 0), FIN, REACH)
     share = np.clip(1 - away / reach, 0, 1)
     return share * carried + (1 - share) * decoded
 
