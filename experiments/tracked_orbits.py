@@ -53,7 +53,7 @@ from jaxshape.search.reconstruction import refiner_for
 RESULTS = Path(__file__).parent / "results"
 
 # With 10 degrees a frame, every second one is a keyframe.
-MAPPING = MappingConfig(keyframe_angle=15.0, keyframe_distance=9.0)
+MAPPING = MappingConfig(keyframe_angle=15.0, keyframe_distance=9.0, fusion="points")
 ALONE = replace(MAPPING, realign=False)
 SYSTEMS = {
     "keyframe": (TrackingConfig(against="keyframe"), ALONE),

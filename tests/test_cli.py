@@ -389,13 +389,16 @@ def test_options_reach_the_map_and_the_search_of_the_object(
     monkeypatch.setattr(finding, "find_start", find_start)
     prompt = ("--click", 10, 20, "--region", 0, 0, 40, 40.5, "--depth-range", 0.5, 3)
     tracking = ("--against", "keyframe", "--on", "object", "--min-inliers", 0.5, "--max-angle", 9)
-    mapping = ("--no-realign", "--isotropic", "--min-hits", 2, "--keyframe-angle", 7)
+    mapping = ("--no-realign", "--isotropic", "--fusion", "points", "--min-hits", 2)
+    mapping += ("--keyframe-angle", 7)
     options = ("--poses", "none", "--first", 1, "--seed", 5, "--output", tmp_path)
     status, _, err = run("reconstruct", *linear, scene, *prompt, *tracking, *mapping, *options)
     assert status == 2 and "enough" in err, err
     assert asked["prompt"] == Prompt((10.0, 20.0), (0.0, 0.0, 40.0, 40.5), (0.5, 3.0))
     assert asked["tracking"] == TrackingConfig("keyframe", "object", 0.5, max_angle=9.0)
-    assert asked["mapping"] == MappingConfig(7.0, realign=False, isotropic=True, min_hits=2)
+    assert asked["mapping"] == MappingConfig(
+        7.0, realign=False, isotropic=True, fusion="points", min_hits=2
+    )
     assert asked["options"] == {"box": None, "first": 1, "use_pose": False} and asked["seed"] == 5
 
 

@@ -137,7 +137,7 @@ class Reconstruct(Rebuild):
                     seconds = {"seconds": round(began - start, 2)}
                     write_progress(self.output, sequence, progress, figures | seconds, running=True)
                     took = time.perf_counter() - began
-                    next_write = time.perf_counter() + max(_SECONDS_BETWEEN_WRITES, 5 * took)
+                    next_write = time.perf_counter() + _SECONDS_BETWEEN_WRITES * max(1.0, 2 * took)
         assert progress is not None  # there is at least the first frame
         with console.status("searching the space of shapes"):
             state, shape = mapper.finish(progress.state)

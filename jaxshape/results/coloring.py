@@ -22,8 +22,12 @@ NEUTRAL = (201, 192, 177)
 BLENDED = 3
 """Frames that give a vertex its colour, at most; each fades out before another takes its place."""
 
-FADE, EDGE = 24.0, 4.0
-"""Pixels from the border of an image, and from a depth jump, below which a frame counts less."""
+FADE = 24.0
+"""Pixels from the border of an image over which a frame counts less and less."""
+
+BLED, EDGE = 2.0, 8.0
+"""Pixels from a depth jump within which colours may be those of the other surface, for depth and
+colour are never registered exactly; and from where on they count in full."""
 
 JUMP = 0.03
 """Neighbouring pixels whose depths differ by more than this share of it lie on two surfaces."""
@@ -60,7 +64,8 @@ def color_vertices(
         mesh: In the object frame, in metres.
         measured: True for vertices on the measured surface; the others are neutral.
         views: Frames that may show it.
-        reach: Metres over which measured vertices that no frame shows take over a colour nearby.
+        reach: Metres over which measured vertices that no frame shows take over a colour nearby,
+            and a quarter of which a depth may differ beyond the sensor's noise.
         sensor: How the noise of depth grows.
 
     Returns:
@@ -100,11 +105,11 @@ def _shown(
     border = np.min([row, column, h - 1 - row, w - 1 - column], axis=0)
     pixel = tuple(np.rint(at).clip([[0], [0]], [[h - 1], [w - 1]]).astype(int))
     cosine = ((t - points) * normals).sum(axis=1) / np.linalg.norm(t - points, axis=1).clip(1e-9)
-    tolerance = reach + 4 * sensor.axial * z**2 + sensor.floor
+    tolerance = reach / 4 + 4 * sensor.axial * z**2 + sensor.floor
     is_shown = (z > 1e-6) & (border > 0) & (cosine > 0.1)
     is_shown &= np.abs(view.depth[pixel] - z) < tolerance
-    edge = _from_jumps(view.depth)[pixel] / EDGE
-    sure = np.clip(border / FADE, 0, 1) * np.clip(edge, 0.02, 1)
+    edge = (_from_jumps(view.depth)[pixel] - BLED) / (EDGE - BLED)
+    sure = np.clip(border / FADE, 0, 1) * np.clip(edge, 0, 1)
     color = np.stack(
         [ndimage.map_coordinates(view.color[..., i], at, np.float32, 1, "nearest")
          for i in range(3)], axis=1

@@ -26,6 +26,10 @@ SMOOTHING = 20
 """Rounds of Taubin's filter that take the staircase off a boolean grid."""
 
 
+COLOR_REACH = 2.0
+"""Voxels over which measured vertices take over a colour from nearby where no frame shows them."""
+
+
 class Observation(NamedTuple):
     """Measurement of one object, and the place of its grid.
 
@@ -145,7 +149,7 @@ def shape_mesh(
         mesh = surface(composed, observation.frame, smoothing=SMOOTHING)
         return ShapeMesh(mesh, None, None, 0)
     mesh, measured, dropped = fuse_surface(observation.field, logits, observation.frame)
-    reach = float(np.max(observation.frame.voxel_size)) / 2
+    reach = COLOR_REACH * float(np.max(observation.frame.voxel_size))
     color = color_vertices(
         mesh, measured, observation.views, reach=reach, sensor=observation.sensor
     )

@@ -29,7 +29,7 @@ from result_folder import (
 from jaxshape.report import illustrations, plots
 from jaxshape.report.page import write_report
 
-FILES = ("mesh.glb", "grid.npz", "trace.npz", "keyframes.json", "result.json")
+FILES = ("mesh.ply", "grid.npz", "trace.npz", "keyframes.json", "result.json")
 
 
 @pytest.fixture
@@ -171,7 +171,7 @@ def test_grids_travel_as_bits(page):
 
 
 def test_the_mesh_is_shown_in_the_object_frame(page, made):
-    mesh = trimesh.load_mesh(made / "mesh.glb")
+    mesh = trimesh.load_mesh(made / "mesh.ply")
     vertices = floats(layers(page)["mesh"]["vertices"]).reshape(-1, 3)
     faces = np.frombuffer(base64.b64decode(layers(page)["mesh"]["faces"]), "<u4")
     back = vertices @ T_WORLD_OBJECT[:3, :3].T + T_WORLD_OBJECT[:3, 3]
@@ -269,7 +269,7 @@ def test_no_folder_is_refused(tmp_path):
 @pytest.mark.usefixtures("quick")
 def test_before_the_object_is_found_the_first_camera_tells_what_is_up(folder):
     (folder / "grid.npz").unlink()
-    (folder / "mesh.glb").unlink()
+    (folder / "mesh.ply").unlink()
     path = floats(layers(report(folder))["trajectory"]["lines"]).reshape(-1, 3)
     np.testing.assert_allclose(path[:2], [[0, 0, 0], [0.1, 0, 0]], atol=1e-5)
 

@@ -88,12 +88,12 @@ def test_a_folder_that_fills_is_shown_as_it_does(made, tmp_path, open_view):
     live = open_view(folder)
     assert not nodes(live)
     shutil.copytree(made / "keyframes", folder / "keyframes")
-    (folder / "mesh.glb").write_bytes(b"half")
+    (folder / "mesh.ply").write_bytes(b"half")
     shutil.copy(made / "keyframes.json", folder)
     assert live.refresh() and len(nodes(live)) == KEYFRAMES + 1
-    assert "mesh.glb cannot be read" in live.figures.content
+    assert "mesh.ply cannot be read" in live.figures.content
     assert live.slider.value == KEYFRAMES - 1  # the newest
-    for name in ("mesh.glb", "grid.npz", "result.json"):
+    for name in ("mesh.ply", "grid.npz", "result.json"):
         shutil.copy(made / name, folder)
     assert live.refresh() and {"/mesh"} | GRIDS <= nodes(live)
     assert "cannot be read" not in live.figures.content

@@ -8,7 +8,9 @@ from PIL import Image
 
 from jaxshape import files
 from jaxshape.data.sequences import read_trajectory
+from jaxshape.mapping.config import MappingConfig
 from jaxshape.mapping.map.recording import trajectory
+from jaxshape.mapping.map.state import assemble
 from jaxshape.report.tables import COLUMNS, keyframe_table
 from jaxshape.results import progress as module
 from jaxshape.results.folder import read_folder
@@ -20,7 +22,7 @@ LAST = 8
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, sequence, steps):
     folder = tmp_path_factory.mktemp("written")
-    result = write_progress(folder, sequence, steps[-1], {"object": "chair"}, 1, running=True)
+    result = write_progress(folder, sequence, steps[-1], {"object": "chair"}, running=True)
     return folder, result
 
 
@@ -77,7 +79,7 @@ def test_trajectories_can_be_read_back(written, steps):
 
 def test_a_result_runs_until_it_is_done(tmp_path, sequence, steps):
     for running in (True, False):
-        result = write_progress(tmp_path, sequence, steps[-1], {}, 1, running=running)
+        result = write_progress(tmp_path, sequence, steps[-1], {}, running=running)
         assert json.loads(json.dumps(result)) == json.loads((tmp_path / "result.json").read_text())
         assert result.get("running", False) == running
     names = {path.name for path in tmp_path.iterdir()}
@@ -108,7 +110,7 @@ def test_each_file_is_replaced_when_whole_and_the_result_last(
         replace(source, target)
 
     monkeypatch.setattr(files.os, "replace", watch)
-    write_progress(tmp_path, sequence, steps[-1], {"object": "earlier"}, 1, running=True)
+    write_progress(tmp_path, sequence, steps[-1], {"object": "earlier"}, running=True)
     assert replaced[-1] == "result.json" and replaced.count("result.json") == 1
     assert set(replaced) == {path.name for path in tmp_path.rglob("*") if path.is_file()}
 
@@ -117,13 +119,13 @@ def test_each_file_is_replaced_when_whole_and_the_result_last(
 
     monkeypatch.setattr(module, "_keyframes", full)
     with pytest.raises(OSError, match="No space"):
-        write_progress(tmp_path, sequence, steps[-1], {"object": "later"}, 1, running=False)
+        write_progress(tmp_path, sequence, steps[-1], {"object": "later"}, running=False)
     assert json.loads((tmp_path / "result.json").read_text())["object"] == "earlier"
     assert not [path for path in tmp_path.rglob(".*")]
 
 
 def test_depth_frames_to_show_are_cut_to_the_object(steps):
-    observation = observation_of(steps[-1].state, 1)
+    observation = observation_of(steps[-1].state)
     assert len(observation.depth) == min(6, len(steps[-1].state.keyframes))
     for shown, keyframe in zip(observation.depth, steps[-1].state.keyframes, strict=False):
         assert np.isfinite(shown).any(axis=0)[[0, -1]].all()
@@ -133,6 +135,14 @@ def test_depth_frames_to_show_are_cut_to_the_object(steps):
                                       np.asarray(keyframe.depth)[segmented])  # fmt: skip
 
 
-def test_more_hits_are_asked_of_a_voxel(steps):
-    one, three = (observation_of(steps[-1].state, hits).occupied for hits in (1, 3))
-    assert 0 < three.sum() < one.sum() and not np.any(three & ~one)
+def test_more_hits_are_asked_of_a_voxel(steps, known):
+    state = steps[-1].state
+
+    def occupied(hits):
+        mapping = MappingConfig(fusion="points", min_hits=hits)
+        return observation_of(assemble(known, state.place, state.keyframes, state.view, mapping))
+
+    one, three = occupied(1), occupied(3)
+    assert one.field is None and observation_of(state).field is not None
+    assert 0 < three.occupied.sum() < one.occupied.sum()
+    assert not np.any(three.occupied & ~one.occupied)
