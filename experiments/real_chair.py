@@ -112,7 +112,7 @@ def run(config: Config, recording: Recording) -> tuple[Journal, dict[str, Rebuil
     Nothing is rebuilt where the results of these settings are there, with all pictures.
     """
     prior, box = load_prior(), read_box(config.box)
-    search = RefineConfig(iterations=config.iterations)
+    search = RefineConfig(iterations=config.iterations, symmetry=False)
     mapping = MappingConfig(fusion="points", keyframe_iterations=config.keyframe_iterations)
     mapper = build_mapper(
         prior, refiner_for("cma", prior, search), search, mapping, TrackingConfig()
