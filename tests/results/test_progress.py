@@ -14,8 +14,8 @@ from jaxshape.mapping.map.recording import trajectory
 from jaxshape.mapping.map.state import assemble
 from jaxshape.report.tables import COLUMNS, keyframe_table
 from jaxshape.results import progress as module
-from jaxshape.results.folder import read_folder
 from jaxshape.results.coloring import NEUTRAL
+from jaxshape.results.folder import read_folder
 from jaxshape.results.progress import color_views, counts, observation_of, write_progress
 from jaxshape.results.surface import read_ply
 
