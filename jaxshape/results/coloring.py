@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxshape.geometry.pixels import Sensor
 
@@ -28,6 +28,10 @@ FADE = 24.0
 BLED, EDGE = 2.0, 8.0
 """Pixels from a depth jump within which colours may be those of the other surface, for depth and
 colour are never registered exactly; and from where on they count in full."""
+
+DOUBTFUL = 1e-6
+"""Factor of colours that may be those of the other surface: they count where there is nothing else,
+not even a colour nearby."""
 
 JUMP = 0.03
 """Neighbouring pixels whose depths differ by more than this share of it lie on two surfaces."""
@@ -84,7 +88,7 @@ def color_vertices(
     if view is None:
         return None
     found = np.full((len(mesh.vertices), 3), NEUTRAL, np.uint8)
-    found[measured] = _spread(points, _blended(quality, colors), quality.max(axis=0) > 0, reach)
+    found[measured] = _spread(points, _blended(quality, colors), quality.max(axis=0), reach)
     return found
 
 
@@ -109,7 +113,7 @@ def _shown(
     is_shown = (z > 1e-6) & (border > 0) & (cosine > 0.1)
     is_shown &= np.abs(view.depth[pixel] - z) < tolerance
     edge = (_from_jumps(view.depth)[pixel] - BLED) / (EDGE - BLED)
-    sure = np.clip(border / FADE, 0, 1) * np.clip(edge, 0, 1)
+    sure = np.clip(border / FADE, 0, 1) * np.clip(edge, DOUBTFUL, 1)
     color = np.stack(
         [ndimage.map_coordinates(view.color[..., i], at, np.float32, 1, "nearest")
          for i in range(3)], axis=1
@@ -139,13 +143,14 @@ def _blended(
 def _spread(
     points: Float[np.ndarray, "n 3"],
     color: Float[np.ndarray, "n 3"],
-    seen: Bool[np.ndarray, " n"],
+    quality: Float[np.ndarray, " n"],
     reach: float,
 ) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of all points: those that no frame shows take that of the nearest, if it is near."""
-    found = np.where(seen[:, None], color, NEUTRAL)
-    if seen.any() and not seen.all():
-        away, nearest = cKDTree(points[seen]).query(points[~seen])
+    """Colours of all points: those in doubt take that of the nearest sure one, if it is near."""
+    found = np.where(quality[:, None] > 0, color, NEUTRAL)
+    sure = quality > 20 * DOUBTFUL  # a frame from less than 0.3 m is none
+    if sure.any() and not sure.all():
+        away, nearest = KDTree(points[sure]).query(points[~sure])
         near = np.asarray(away) < reach
-        found[np.flatnonzero(~seen)[near]] = color[seen][np.asarray(nearest)[near]]
+        found[np.flatnonzero(~sure)[near]] = color[sure][np.asarray(nearest)[near]]
     return np.rint(found).astype(np.uint8)

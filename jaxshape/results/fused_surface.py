@@ -21,8 +21,8 @@ from jaxshape.geometry.distance import DistanceField, mean_distance
 from jaxshape.geometry.grid import GridFrame
 
 REACH, FIN = 6.0, 1.6
-"""Fine voxels over which measured distances fade out beyond the edge of what was measured, and where
-they are solid and the decoded shape is free."""
+"""Fine voxels over which measured distances fade out beyond the edge of what was measured; and the
+same where they are solid and the decoded shape is free."""
 
 ROUNDS = 10
 """Rounds of Taubin's filter, which take off the grain that the noise of few frames leaves. On CAD

@@ -180,6 +180,7 @@ def read_ply(path: str | os.PathLike[str]) -> MeshFile:
         raise ValueError("it has no faces, or vertices that are not finite")
     vertex = mesh.metadata["_ply_raw"]["vertex"]
     measured = vertex["data"]["measured"] > 0 if "measured" in vertex["properties"] else None
-    color = mesh.visual.vertex_colors[:, :3] if mesh.visual.kind == "vertex" else None
+    visual: Any = mesh.visual
+    color = visual.vertex_colors[:, :3] if visual.kind == "vertex" else None
     plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     return MeshFile(plain, measured, None if color is None else np.asarray(color))

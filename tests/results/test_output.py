@@ -106,7 +106,7 @@ def test_a_measured_surface_is_told_apart_and_counted(tmp_path):
     block = solid((4, 6, 6), (16, 26, 26))
     speck = solid((2, 28, 28), (4, 30, 30))
     logits = np.where(block | speck, 6.0, -6.0).astype(np.float32)
-    found = RECONSTRUCTION._replace(logits=jnp.asarray(logits)[None])
+    found = RECONSTRUCTION._replace(fill_logits=jnp.asarray(logits)[None])
     seen = OBSERVATION._replace(frame=frame, field=field, truth=None)
     result = write_result(tmp_path, seen, found, {})
     again = read_ply(tmp_path / "mesh.ply")

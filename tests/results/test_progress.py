@@ -1,6 +1,7 @@
 """What a run leaves on disk, while it runs and when it ends."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ from jaxshape.mapping.map.recording import trajectory
 from jaxshape.mapping.map.state import assemble
 from jaxshape.report.tables import COLUMNS, keyframe_table
 from jaxshape.results import progress as module
+from jaxshape.results.coloring import NEUTRAL
 from jaxshape.results.folder import read_folder
-from jaxshape.results.progress import counts, observation_of, write_progress
+from jaxshape.results.progress import color_views, counts, observation_of, write_progress
+from jaxshape.results.surface import read_ply
 
 LAST = 8
 
@@ -122,6 +125,35 @@ def test_each_file_is_replaced_when_whole_and_the_result_last(
         write_progress(tmp_path, sequence, steps[-1], {"object": "later"}, running=False)
     assert json.loads((tmp_path / "result.json").read_text())["object"] == "earlier"
     assert not [path for path in tmp_path.rglob(".*")]
+
+
+def test_the_mesh_tells_what_was_measured_and_has_no_colours_without_colour_images(written):
+    folder, result = written
+    found = read_ply(folder / "mesh.ply")
+    assert found.color is None and 0.05 < found.measured.mean() < 0.95
+    assert 0.05 < result["mesh_measured"] < 0.95 and result["mesh_pieces_dropped"] >= 0
+
+
+def test_the_colours_of_the_keyframes_end_on_the_mesh(tmp_path, sequence, steps, walk):
+    """All images are of one colour; so is all that was measured."""
+    files = []
+    for one in sequence.files:
+        path = tmp_path / f"{one.name}.png"
+        Image.fromarray(np.full((*walk.depth.shape[1:], 3), (150, 90, 30), np.uint8)).save(path)
+        files.append(one._replace(color=path))
+    colored = replace(sequence, files=tuple(files))
+    views = list(color_views(colored, steps[-1]))
+    assert len(views) == len(steps[-1].state.keyframes)
+    T_world_object = steps[-1].state.place.box.T_world_object
+    for view, keyframe in zip(views, steps[-1].state.keyframes, strict=True):
+        np.testing.assert_allclose(
+            T_world_object @ view.T_object_camera, keyframe.T_world_camera.as_matrix(), atol=1e-5
+        )
+    write_progress(tmp_path / "out", colored, steps[-1], {}, running=False)
+    found = read_ply(tmp_path / "out" / "mesh.ply")
+    is_painted = (found.color == (150, 90, 30)).all(axis=1)
+    assert is_painted[found.measured].mean() > 0.8
+    assert (found.color[~is_painted] == NEUTRAL).all()
 
 
 def test_depth_frames_to_show_are_cut_to_the_object(steps):
