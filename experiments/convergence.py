@@ -92,7 +92,10 @@ def run(config: Config) -> Journal:
     prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
-        "searches": {name: [method, repr(how)] for name, (method, how) in SEARCHES.items()},
+        "searches": {
+            name: [method, repr(replace(how, objective="balanced"))]
+            for name, (method, how) in SEARCHES.items()
+        },
         "iterations": [sampled(config, 30), sampled(config, 12)],
         "weights": fingerprint(prior),
     }
