@@ -33,7 +33,7 @@ from jaxshape.report.figures import tidy
 from jaxshape.report.palette import BLUE, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
-from jaxshape.search.completion import compose
+from jaxshape.search.composition import compose
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.reconstruction import code_penalty, search_space

@@ -41,7 +41,7 @@ from .results.fused_surface import FusedSurface, fuse_surface
 from .results.metrics import Bounds, ShapeScores, bounds, chamfer_l1, f_score, shape_scores
 from .results.surface import surface, write_mesh
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
-from .search.completion import Completion, complete, compose
+from .search.composition import Composition, complete, compose
 from .search.config import RefineConfig
 from .search.methods import build_refiner
 from .search.methods.cma import cma
@@ -91,7 +91,7 @@ __all__ = [
     "Candidate",
     "Capture",
     "CmaState",
-    "Completion",
+    "Composition",
     "DistanceField",
     "Distribution",
     "FusedSurface",

@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.results.output import Observation
-from jaxshape.search.completion import compose
+from jaxshape.search.composition import compose
 from jaxshape.search.reconstruction import Reconstruction
 from jaxshape.search.refiner import StopReason, Trace
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.shapes import ShapePrior, decode, encode
-from jaxshape.search.completion import complete
+from jaxshape.search.composition import complete
 from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty

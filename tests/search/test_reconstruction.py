@@ -13,7 +13,7 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.pca import PCA
 from jaxshape.model.shapes import decode, encode
-from jaxshape.search.completion import complete, compose
+from jaxshape.search.composition import complete, compose
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import (
     code_penalty,

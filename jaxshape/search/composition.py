@@ -11,7 +11,7 @@ from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.geometry.symmetry import mirrored, symmetrised
 
 
-class Completion(NamedTuple):
+class Composition(NamedTuple):
     """A composed shape, and what fills it; leading axes are batch axes.
 
     Attributes:
@@ -28,7 +28,7 @@ class Completion(NamedTuple):
     agreement: Float[Array, "*batch"] | None
 
 
-def complete(grids: Grids, logits: Float[Array, "*batch x y z"], *, symmetry: bool) -> Completion:
+def complete(grids: Grids, logits: Float[Array, "*batch x y z"], *, symmetry: bool) -> Composition:
     """Fill what was not measured with a decoded shape, and with the mirror image of what was.
 
     Args:
@@ -43,7 +43,7 @@ def complete(grids: Grids, logits: Float[Array, "*batch x y z"], *, symmetry: bo
         logits = symmetrised(logits, other)
         symmetric, agreement = other.symmetric, other.agreement
     composed = compose(grids.occupied, grids.occluded, jax.nn.sigmoid(logits))
-    return Completion(composed, logits, symmetric, agreement)
+    return Composition(composed, logits, symmetric, agreement)
 
 
 def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*batch x y z"]:

@@ -7,7 +7,7 @@ import pytest
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.symmetry import mirror
-from jaxshape.search.completion import complete, compose
+from jaxshape.search.composition import complete, compose
 
 KEY = jax.random.key(0)
 LOGITS = jax.random.normal(KEY, (2, 16, 16, 16))
