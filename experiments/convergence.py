@@ -92,7 +92,10 @@ def run(config: Config) -> Journal:
     prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
-        "searches": {name: [method, repr(how)] for name, (method, how) in SEARCHES.items()},
+        "searches": {
+            name: [method, repr(replace(how, objective="balanced"))]
+            for name, (method, how) in SEARCHES.items()
+        },
         "iterations": [sampled(config, 30), sampled(config, 12)],
         "weights": fingerprint(prior),
     }
@@ -123,7 +126,8 @@ def along(method: str, how: RefineConfig, prior: ShapePrior, config: Config) -> 
     often, seldom = (jnp.array(sampled(config, n)) - 1 for n in (30, 12))
 
     def contest(keys: Array, prior: ShapePrior, case: Case) -> Scores:
-        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, how)
+        F, M = case.grids.occupied, case.grids.occluded
+        found = reconstruct(keys, prior, F, M, refiner, how)
         assert found.trace is not None and found.path is not None and found.iterations is not None
         drawn = found.trace.loss
         return {

@@ -194,7 +194,8 @@ def contestant(search: Search, budgets: tuple[int, ...]) -> Contestant:
     config = RefineConfig(iterations=search.iterations, space=search.space)
 
     def contest(keys, prior, case):
-        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, config)
+        F, M = case.grids.occupied, case.grids.occluded
+        found = reconstruct(keys, prior, F, M, refiner, config)
         assert found.trace is not None and found.path is not None and found.stop is not None
         calls = search.calls(found.trace.evaluations)  # after each iteration
         iterations = jnp.sum(calls[:, None] <= jnp.array((0, *budgets))[:, None], axis=-1)

@@ -33,11 +33,11 @@ from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE, PINK, RED
 from jaxshape.report.pictures import render_measurement, render_voxels
-from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, observe
+from jaxshape.results.evaluation import Case, case_keys, observe
 from jaxshape.results.journal import Journal
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct_jit, refiner_for
-from study import TUNED, Claim, Subject, TestSet, conclude, subjects
+from study import SEEN, TUNED, Claim, Subject, TestSet, conclude, subjects
 
 RESULTS = Path(__file__).parent / "results"
 CREATORS = Path(__file__).with_name("cad_seats.json")
@@ -153,13 +153,13 @@ def rebuild(
         model = load_object(chair.item)
         if isinstance(model, Skipped):
             continue
-        case = observe(model, EvaluateConfig(tuple(frames)))
+        case = observe(model, replace(SEEN, frames=tuple(frames)))
         if case is not None:
             seen.append((chair, case))
     keys = jnp.concatenate([case_keys(chair.name, frames) for chair, _ in seen])
     case = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in seen])
     run = reconstruct_jit(refiner_for("cma", prior, search), search)
-    found = jax.device_get(run(keys, prior, case.occupied, case.occluded))
+    found = jax.device_get(run(keys, prior, case.grids.occupied, case.grids.occluded))
     found = found._replace(trace=None, path=None)
     return [
         (
@@ -192,7 +192,7 @@ def row(one: Shown) -> dict[str, Any]:
 
 def _shapes(one: Shown) -> dict[str, Any]:
     return {
-        "F and M": one.case.occupied,
+        "F and M": one.case.grids.occupied,
         "encoder": one.found.completed_first,
         "refined": one.found.completed,
         "composed": one.found.composed,
@@ -298,7 +298,9 @@ def _draw_block(
 
 def _picture(one: Shown, name: str, i: int) -> np.ndarray:
     """One cell of a block."""
-    occupied, occluded, surface = (np.asarray(grid[i]) for grid in one.case)
+    occupied, occluded, surface = (
+        np.asarray(grid[i]) for grid in (*one.case.grids[:2], one.case.surface)
+    )
     first, refined, composed = (
         np.asarray(grid[i])
         for grid in (one.found.completed_first, one.found.completed, one.found.composed)

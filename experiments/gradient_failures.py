@@ -35,17 +35,17 @@ from rich.progress import track
 from figures import PAGE, save_column
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
-from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.report.panels import grid_panel, measurement_panel
-from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
+from jaxshape.results.evaluation import Case, case_keys, fill, observe
 from jaxshape.results.journal import Journal
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 from jaxshape.search.residuals import LESS_FREE, cross_entropy, weigh
 from study import (
+    SEEN,
     TUNED,
     Claim,
     Subject,
@@ -225,7 +225,7 @@ def row_name(one: Example) -> str:
 def seen(chair: Subject, frames: int) -> Case:
     """What the first frames show; the chair has been used before, so it can be."""
     model = load_object(chair.item)
-    case = None if isinstance(model, Skipped) else observe(model, EvaluateConfig((frames,)))
+    case = None if isinstance(model, Skipped) else observe(model, replace(SEEN, frames=(frames,)))
     if case is None:
         raise ValueError(f"{chair.name} cannot be observed: {model}. Remove the earlier results.")
     return jax.tree.map(lambda x: jnp.asarray(x[0]), case)
@@ -272,9 +272,8 @@ def searcher(method: str, prior: ShapePrior, config: RefineConfig) -> Callable[.
 
     @jax.jit
     def search(keys, prior, case, codes):
-        found = reconstruct(
-            keys, prior, case.occupied, case.occluded, refiner, config, earlier=codes
-        )
+        F, M = case.grids.occupied, case.grids.occluded
+        found = reconstruct(keys, prior, F, M, refiner, config, earlier=codes)
         return Ends(found.code, found.objective, iou(found.completed, case.surface))
 
     return search
@@ -288,7 +287,7 @@ def objectives_between(
     b: Float[Array, "case d"],
 ) -> Float[Array, "case point"]:
     """The objective along the straight line from one code to another."""
-    targets = weigh(Grids(case.occupied, case.occluded), decode(prior, first), LESS_FREE)
+    targets = weigh(case.grids, decode(prior, first), LESS_FREE)
     share = jnp.linspace(0, 1, POINTS)[:, None]
     codes = a[:, None] + share * (b - a)[:, None]
     return cross_entropy(decode(prior, codes), jax.tree.map(lambda x: x[:, None], targets))
@@ -409,7 +408,7 @@ def plot(journal: Journal, config: Config) -> None:
 def panels(row: Rows, prior: ShapePrior, config: Config) -> Iterator[Any]:
     """Truth, F and every search's shape, its IoU below."""
     chair = next(one for one in subjects(config.test) if one.name == row["name"])
-    occupied, occluded, surface = (np.asarray(x) for x in seen(chair, row["frames"]))
+    (occupied, occluded, _), surface = jax.device_get(seen(chair, row["frames"]))
     codes = jnp.array([row["code"][name] for name in SHAPES])
     shapes = np.asarray(decode(prior, codes) > 0)
     yield grid_panel("truth", surface, "truth", note=row["group"])

@@ -43,8 +43,9 @@ from jaxshape.geometry.symmetry import mirrored, symmetrised
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.journal import Journal
+from jaxshape.search.composition import compose
 from jaxshape.search.config import RefineConfig
-from jaxshape.search.reconstruction import compose, refiner_for, search_space
+from jaxshape.search.reconstruction import refiner_for, search_space
 from jaxshape.search.residuals import BALANCED, SOFT, Target
 from jaxshape.search.run import refine
 from study import Claim, conclude, listed, name_of

@@ -12,7 +12,7 @@ with the IoUs under it; about a minute on two cores, most of it compiling.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -34,9 +34,9 @@ from jaxshape.model.weights import load_prior
 from jaxshape.report.palette import COLORS
 from jaxshape.report.panels import Panel
 from jaxshape.report.pictures import render_mesh, render_voxels
-from jaxshape.results.evaluation import Case, EvaluateConfig, observe
-from jaxshape.search.config import RefineConfig
+from jaxshape.results.evaluation import Case, observe
 from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
+from study import SEARCH, SEEN
 
 AZIMUTH = -65.0
 """Of the pictures, in degrees: the handle in profile, from the side that four frames do not see."""
@@ -158,7 +158,8 @@ def run(config: Config) -> list[str]:
 
 def draw(mesh: trimesh.Trimesh, case: Any, found: Any) -> list[Panel]:
     """One mug as it is, as four frames measure it (`Case`), and rebuilt (`Reconstruction`)."""
-    composed = np.where(case.occluded, 2 * found.composed, case.occupied.astype(int))
+    occupied, occluded, _ = case.grids
+    composed = np.where(occluded, 2 * found.composed, occupied.astype(int))
 
     def picture(title: str, labels: Any, *colors: str, scored: Any = None) -> Panel:
         note = "" if scored is None else f"IoU {float(iou(scored, case.surface)):.2f}"
@@ -169,7 +170,7 @@ def draw(mesh: trimesh.Trimesh, case: Any, found: Any) -> list[Panel]:
     return [
         Panel("a mug", render_mesh(mesh, color=COLORS["truth"], azimuth=AZIMUTH)),
         picture("on the grid", case.surface, "truth"),
-        picture("F, four frames", case.occupied, "measured", scored=case.occupied),
+        picture("F, four frames", occupied, "measured", scored=occupied),
         picture("encoder", first, "predicted", scored=first),
         picture("refined", refined, "predicted", scored=refined),
         picture("composed", composed, "measured", "predicted", scored=found.composed),
@@ -180,12 +181,12 @@ def plot(config: Config, prior: ShapePrior, rows: int = 4) -> None:
     """Draw mugs held out of training, a row for each."""
     held_out = hold_out(meshes.list_meshes(config.output))[1][:rows]
     models = [cast(meshes.Model, meshes.load(source, front="x")) for source in held_out]
-    seen = [cast(Case, observe(model, EvaluateConfig(frames=(4,)))) for model in models]
-    cases = Case(*map(jnp.concatenate, zip(*seen, strict=True)))
-    search = RefineConfig(iterations=2 if config.smoke else config.iterations)
+    seen = [cast(Case, observe(model, replace(SEEN, frames=(4,)))) for model in models]
+    cases = jax.tree.map(lambda *x: jnp.concatenate(x), *seen)
+    search = replace(SEARCH, iterations=2 if config.smoke else config.iterations)
     rebuild = reconstruct_jit(refiner_for("cma", prior, search), search)
     keys = jax.random.split(jax.random.key(0), len(models))
-    found = rebuild(keys, prior, cases.occupied, cases.occluded)
+    found = rebuild(keys, prior, cases.grids.occupied, cases.grids.occluded)
     pictures = [
         draw(model.mesh, *jax.device_get(jax.tree.map(lambda x, i=i: x[i], (cases, found))))
         for i, model in enumerate(track(models, "pictures"))

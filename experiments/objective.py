@@ -26,7 +26,6 @@ import tyro
 from jaxtyping import Array, Bool, Float
 
 from figures import PAGE, interval, save_column
-from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.weights import fingerprint, load_prior
@@ -34,12 +33,14 @@ from jaxshape.report.figures import tidy
 from jaxshape.report.palette import BLUE, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
+from jaxshape.search.composition import compose
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods import build_refiner
-from jaxshape.search.reconstruction import code_penalty, compose, search_space
+from jaxshape.search.reconstruction import code_penalty, search_space
 from jaxshape.search.residuals import Weights, weigh
 from jaxshape.search.run import refine
 from study import (
+    SEARCH,
     Claim,
     Contestant,
     TestSet,
@@ -130,7 +131,7 @@ def run(config: Config, residuals: dict[str, Residual] = RESIDUALS) -> tuple[Jou
         "iterations": config.iterations,
         "weights": fingerprint(prior),
     }
-    contestants = {"encoder": by_method("encoder", prior, RefineConfig())} | {
+    contestants = {"encoder": by_method("encoder", prior, SEARCH)} | {
         name: by_residual(residual, prior, config.iterations)
         for name, residual in residuals.items()
     }
@@ -152,11 +153,11 @@ def by_residual(residual: Residual, prior: ShapePrior, iterations: int) -> Conte
     penalty = code_penalty(prior, search.prior_weight)
 
     def contest(keys, prior: ShapePrior, case: Case):
-        grids = Grids(case.occupied, case.occluded)
+        grids = case.grids
         code = encode(prior, grids)
         anchor = logits = decode(prior, code)
         for scale in residual.prior_scales:
-            alpha = scale if residual.alpha_is_printed else scale / printed_alpha(case.occluded)
+            alpha = scale if residual.alpha_is_printed else scale / printed_alpha(grids.occluded)
             # Against what was measured as occupied; Adam does not care for a common factor.
             weights = Weights(1 / residual.occupied_weight, alpha / residual.occupied_weight)
             targets = weigh(grids, anchor, weights)
@@ -166,7 +167,7 @@ def by_residual(residual: Residual, prior: ShapePrior, iterations: int) -> Conte
             )  # fmt: skip
             code, logits = found.code, found.logits
             anchor = logits if residual.anchor_moves else anchor
-        composed = compose(case.occupied, case.occluded, logits > 0)
+        composed = compose(grids.occupied, grids.occluded, logits > 0)
         return {"iou": iou(logits > 0, case.surface), "iou_composed": iou(composed, case.surface)}
 
     return contest

@@ -112,8 +112,8 @@ def run(config: Config, recording: Recording) -> tuple[Journal, dict[str, Rebuil
     Nothing is rebuilt where the results of these settings are there, with all pictures.
     """
     prior, box = load_prior(), read_box(config.box)
-    search = RefineConfig(iterations=config.iterations)
-    mapping = MappingConfig(keyframe_iterations=config.keyframe_iterations)
+    search = RefineConfig(iterations=config.iterations, symmetry=False)
+    mapping = MappingConfig(fusion="points", keyframe_iterations=config.keyframe_iterations)
     mapper = build_mapper(
         prior, refiner_for("cma", prior, search), search, mapping, TrackingConfig()
     )
@@ -132,7 +132,7 @@ def run(config: Config, recording: Recording) -> tuple[Journal, dict[str, Rebuil
     rebuilt = {}
     for way in WAYS:
         began = time.perf_counter()
-        moments = list(_moments(way, config, recording, box, prior, mapper, mapping))
+        moments = list(_moments(way, config, recording, box, prior, mapper))
         rebuilt[way] = _finished(moments, box)
         rows = {str(one.keyframes): agreement(one) for one in rebuilt[way].moments}
         journal.add({way: rows}, time.perf_counter() - began)
@@ -147,7 +147,6 @@ def _moments(
     box: Box,
     prior: ShapePrior,
     mapper: Mapper,
-    mapping: MappingConfig,
 ) -> Iterator[tuple[Moment, MapState]]:
     """The map after each keyframe, and at last after the long search."""
     start = find_start(recording, prior, Prompt(), box=box, use_pose=True)
@@ -157,17 +156,15 @@ def _moments(
         recording, start, mapper, prior, chosen=chosen, use_poses=way == "given"
     ):
         if progress.logs[-1].status == "keyframe" and progress.shape is not None:
-            yield _moment(progress, progress.state, progress.shape, mapping), progress.state
+            yield _moment(progress, progress.state, progress.shape), progress.state
     assert progress is not None
     state, shape = mapper.finish(progress.state)
     if shape is not None:
-        yield _moment(progress, state, shape, mapping), state
+        yield _moment(progress, state, shape), state
 
 
-def _moment(
-    progress: Progress, state: MapState, shape: Reconstruction, mapping: MappingConfig
-) -> Moment:
-    occupied, occluded = grids_of(state.measurement, mapping.min_hits)
+def _moment(progress: Progress, state: MapState, shape: Reconstruction) -> Moment:
+    occupied, occluded, _ = grids_of(state)
     last = [log.index for log in progress.logs if log.status == "keyframe"][-1]
     return Moment(
         keyframes=len(state.keyframes),

@@ -33,6 +33,7 @@ from jaxshape.files import write_json
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import Mapper, build_mapper
 from jaxshape.mapping.map.recording import Progress, follow, trajectory
+from jaxshape.mapping.map.state import grids_of
 from jaxshape.mapping.placement.finding import find_start
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.mapping.tracking import icp
@@ -80,13 +81,14 @@ def main(config: Config) -> None:
 def run(config: Config) -> tuple[dict[str, Any], dict[str, list[Panel]]]:
     """Rebuild the object each way; figures, and pictures of the meshes."""
     sequence, box, prior = open_sequence(config.recording), read_box(config.box), load_prior()
-    search = RefineConfig(iterations=config.iterations)
-    mapping = MappingConfig(keyframe_iterations=2) if config.smoke else MappingConfig()
+    search = RefineConfig(iterations=config.iterations, symmetry=False)
+    iterations = 2 if config.smoke else MappingConfig.keyframe_iterations
+    mapping = MappingConfig(fusion="points", keyframe_iterations=iterations)
     refiner = refiner_for("cma", prior, search)
     mapper = build_mapper(prior, refiner, search, mapping, TrackingConfig())
     metrics, meshes = {}, {}
     for way in WAYS:
-        metrics[way], meshes[way] = _rebuild(way, config, sequence, box, prior, mapper, mapping)
+        metrics[way], meshes[way] = _rebuild(way, config, sequence, box, prior, mapper)
         print(way, metrics[way], flush=True)
     settings = asdict(config) | {"recording": config.recording.name, "box": config.box.name}
     settings.pop("results")
@@ -100,7 +102,6 @@ def _rebuild(
     box: Box,
     prior: ShapePrior,
     mapper: Mapper,
-    mapping: MappingConfig,
 ) -> tuple[dict[str, Any], list[Panel]]:
     prompt = Prompt(click=config.click)
     alone = way == "click"
@@ -126,7 +127,7 @@ def _rebuild(
         "seconds_per_part": _seconds(progress),
     }
     mesh = surface(shape.composed[0], state.place.frame, smoothing=SMOOTHING)
-    occupied = np.asarray(state.measurement.hits >= mapping.min_hits)
+    occupied = np.asarray(grids_of(state).occupied)
     title = {"given": "poses given", "first": "first pose given", "click": "a click"}[way]
     panels = [grid_panel(f"{title}: F", occupied, "measured")]
     panels += [Panel(side, render_mesh(mesh, azimuth=a, size=400)) for side, a in SIDES.items()]

@@ -151,7 +151,8 @@ def trying(
             refiner, width = search_with(step)
             covariance = jnp.where(is_raw, jnp.eye(len(prior.code_mean)), prior.code_covariance)
             space = prior._replace(code_covariance=width**2 * covariance)
-            found = reconstruct(keys, space, case.occupied, case.occluded, refiner, config)
+            F, M = case.grids.occupied, case.grids.occluded
+            found = reconstruct(keys, space, F, M, refiner, config)
             assert found.trace is not None
             drawn = jnp.nan_to_num(found.trace.loss, posinf=WORST)
             return {

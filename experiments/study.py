@@ -32,10 +32,15 @@ from jaxshape.search.reconstruction import Reconstruction, reconstruct, refiner_
 CASES_AT_A_TIME = 64
 """Cases searched together, unless a chair has more: the rows between two entries of the journal."""
 
+SEEN = EvaluateConfig(camera="paper", noise=False, fusion="points")
+"""How chairs are seen in the paper: square images without noise, their points counted in voxels."""
+SEARCH = RefineConfig(symmetry=False)
+"""How shapes are composed in the paper: nothing is mirrored."""
+
 TUNED: dict[str, tuple[str, RefineConfig]] = {
-    "gradient descent": ("gradient", RefineConfig(space="raw", step_size=40.0)),
-    "Adam": ("gradient:adam", RefineConfig()),
-    "CMA-ES": ("cma", RefineConfig(space="raw", sigma0=0.14)),
+    "gradient descent": ("gradient", replace(SEARCH, space="raw", step_size=40.0)),
+    "Adam": ("gradient:adam", SEARCH),
+    "CMA-ES": ("cma", replace(SEARCH, space="raw", sigma0=0.14)),
 }
 """The paper's searches and Adam, with the values that experiments/step_size.py finds best."""
 
@@ -100,7 +105,8 @@ def by_method(method: str, prior: ShapePrior, config: RefineConfig) -> Contestan
     refiner = refiner_for(method, prior, config)
 
     def contest(keys, prior, case):
-        found = reconstruct(keys, prior, case.occupied, case.occluded, refiner, config)
+        F, M = case.grids.occupied, case.grids.occluded
+        found = reconstruct(keys, prior, F, M, refiner, config)
         return shape_and_objective(found, case)
 
     return contest
@@ -108,7 +114,7 @@ def by_method(method: str, prior: ShapePrior, config: RefineConfig) -> Contestan
 
 def tuned(prior: ShapePrior, iterations: int) -> dict[str, Contestant]:
     """The encoder and the `TUNED` searches, all with the same number of iterations."""
-    searches = {"encoder": ("encoder", RefineConfig())} | TUNED
+    searches = {"encoder": ("encoder", SEARCH)} | TUNED
     return {
         name: by_method(method, prior, replace(config, iterations=iterations))
         for name, (method, config) in searches.items()
@@ -126,7 +132,7 @@ def shape_and_objective(found: Reconstruction, case: Case) -> Scores:
 
 def measurement(keys: Key[Array, " case"], prior: ShapePrior, case: Case) -> Scores:
     """The paper's lower and upper bound: F with what is occluded set to empty, and to full."""
-    return bounds(*case)._asdict()
+    return bounds(case.grids.occupied, case.grids.occluded, case.surface)._asdict()
 
 
 def compare(
@@ -147,7 +153,7 @@ def compare(
     of a real depth sensor. Fewer cases `at_a_time` lose less of a long search when it is killed.
     """
     chairs = subjects(test) if isinstance(test, TestSet) else test
-    config = EvaluateConfig(tuple(frames), noise=noise)
+    config = replace(SEEN, frames=tuple(frames), noise=noise)
     missing = [one for one in chairs if _left(contestants, [one], journal)]
     searches = sum(len(_left(contestants, [one], journal)) for one in missing)
     group = max(1, at_a_time // len(frames))

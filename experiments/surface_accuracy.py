@@ -42,7 +42,7 @@ from jaxshape.results.fused_surface import fuse_surface
 from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.surface import surface
-from jaxshape.search.reconstruction import compose
+from jaxshape.search.composition import compose
 from study import Claim, conclude, listed, name_of
 
 RESULTS = Path(__file__).parent / "results"

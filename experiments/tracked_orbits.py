@@ -53,7 +53,7 @@ from jaxshape.search.reconstruction import refiner_for
 RESULTS = Path(__file__).parent / "results"
 
 # With 10 degrees a frame, every second one is a keyframe.
-MAPPING = MappingConfig(keyframe_angle=15.0, keyframe_distance=9.0)
+MAPPING = MappingConfig(keyframe_angle=15.0, keyframe_distance=9.0, fusion="points")
 ALONE = replace(MAPPING, realign=False)
 SYSTEMS = {
     "keyframe": (TrackingConfig(against="keyframe"), ALONE),
@@ -149,7 +149,7 @@ def _run_seat(source: meshes.MeshSource, config: Config) -> dict[str, Any]:
 
 @cache
 def _search(iterations: int):
-    prior, search = load_prior(), RefineConfig(iterations=iterations)
+    prior, search = load_prior(), RefineConfig(iterations=iterations, symmetry=False)
     return prior, refiner_for("gradient:adam", prior, search), search
 
 

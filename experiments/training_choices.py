@@ -45,8 +45,8 @@ from jaxshape.model.config import PRESETS, Architecture, Completion, TrainConfig
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.training import finished_prior, train
 from jaxshape.report.palette import COLORS
-from jaxshape.results.evaluation import EvaluateConfig, evaluate, summarize
-from jaxshape.search.config import RefineConfig
+from jaxshape.results.evaluation import evaluate, summarize
+from study import SEARCH, SEEN
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -152,9 +152,9 @@ def judge(
     prior: ShapePrior, tests: dict[str, Sequence[Model]], faulty: Faulty, config: Config
 ) -> dict[str, Any]:
     """IoU by frames and method, and ceiling, on each test set; and the encoder's with faults."""
-    search = RefineConfig(iterations=config.iterations)
-    scoring = EvaluateConfig((1, 4, 8), ("encoder", "cma", "gradient:adam"), ceiling=True,
-                             refine=search)  # fmt: skip
+    search = replace(SEARCH, iterations=config.iterations)
+    methods = ("encoder", "cma", "gradient:adam")
+    scoring = replace(SEEN, frames=(1, 4, 8), methods=methods, ceiling=True, refine=search)
     found: dict[str, Any] = {}
     for name, models in tests.items():
         scores = [s for s in evaluate(prior, models, scoring) if not isinstance(s, Skipped)]

@@ -155,7 +155,7 @@ def solid(surface: Bool[Array, "*batch x y z"]) -> Bool[Array, "*batch x y z"]:
 
 def measured(keys: Any, prior: ShapePrior, case: Case) -> Scores:
     """The bounds, and how much of what is occluded is empty, for true surfaces and solids."""
-    occupied, occluded, surface = case
+    (occupied, occluded, _), surface = case
     filled = solid(surface)
     as_solid = bounds(occupied, occluded, filled)._asdict()
     hidden = jnp.maximum(occluded.sum(axis=(-3, -2, -1)), 1)

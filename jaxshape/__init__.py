@@ -24,7 +24,8 @@ Conventions, stated here once:
 - `decode` gives logits; a voxel is occupied where they are positive. Losses are in nats per voxel.
 - `PAPER`, `BALANCED` and `SOFT` are residuals, the objectives of a search: Eq. 7 as printed, Eq. 7
   with a third of the weight on measured free space, and the latter with voxels weighted by how sure
-  their measurement is (`help(js.Residual)`).
+  their measurement is (`help(js.Residual)`). Where none is named, soft grids get `SOFT` and binary
+  ones `BALANCED`.
 - Leading axes `*batch` broadcast; `b` or `object` is one batch axis.
 
 Data moves one way, and so do imports:

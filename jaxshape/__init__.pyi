@@ -41,6 +41,7 @@ from .results.fused_surface import FusedSurface, fuse_surface
 from .results.metrics import Bounds, ShapeScores, bounds, chamfer_l1, f_score, shape_scores
 from .results.surface import surface, write_mesh
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
+from .search.composition import Composition, complete, compose
 from .search.config import RefineConfig
 from .search.methods import build_refiner
 from .search.methods.cma import cma
@@ -50,7 +51,6 @@ from .search.methods.hybrid import polished
 from .search.objective import objective
 from .search.reconstruction import (
     Reconstruction,
-    compose,
     fit_surface,
     reconstruct,
     refiner_for,
@@ -91,6 +91,7 @@ __all__ = [
     "Candidate",
     "Capture",
     "CmaState",
+    "Composition",
     "DistanceField",
     "Distribution",
     "FusedSurface",
@@ -144,6 +145,7 @@ __all__ = [
     "cma_ask",
     "cma_start",
     "cma_tell",
+    "complete",
     "compose",
     "cross_entropy",
     "decode",

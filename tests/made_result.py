@@ -5,7 +5,8 @@ import numpy as np
 
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.results.output import Observation
-from jaxshape.search.reconstruction import Reconstruction, compose
+from jaxshape.search.composition import compose
+from jaxshape.search.reconstruction import Reconstruction
 from jaxshape.search.refiner import StopReason, Trace
 
 T_WORLD_OBJECT = np.array([[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]], float)
@@ -36,6 +37,9 @@ def reconstruction(seen: Observation, first, completed, *, steps: int) -> Recons
         logits=jnp.where(completed, 1.0, -1.0)[None],
         completed=jnp.asarray(completed)[None],
         composed=composed[None],
+        fill_logits=jnp.where(completed, 1.0, -1.0)[None],
+        symmetric=jnp.array([True]),
+        agreement=jnp.array([0.875]),
         first_objective=jnp.array([0.5]),
         objective=jnp.array([0.25]),
         trace=Trace(*(losses,) * 3, evaluations),

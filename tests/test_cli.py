@@ -20,6 +20,7 @@ from jaxshape import cli, process
 from jaxshape.cli.learning import preset_in
 from jaxshape.data import dataset, sequences
 from jaxshape.data.archives import list_meshes
+from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.split import hold_out
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
@@ -32,6 +33,7 @@ from jaxshape.model.weights import fingerprint, load_card, load_prior, save_prio
 from jaxshape.report.plots import plot_search
 from jaxshape.results import evaluation
 from jaxshape.results.traces import read_search
+from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import families
 
 COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
@@ -253,6 +255,7 @@ def test_a_search_of_ones_own_is_found_in_the_current_folder(refused, tmp_path, 
         (("--frames", "2,2"), "--frames is '2,2'"),
         (("--methods", "encoder,magic"), "no method 'magic'"),
         (("--up", "z"), "must be perpendicular"),
+        (("--noise", "--no-noise"), "Give --noise or --no-noise, not both"),
     ],
 )
 def test_options_of_an_evaluation_out_of_range_are_refused(
@@ -387,13 +390,16 @@ def test_options_reach_the_map_and_the_search_of_the_object(
     monkeypatch.setattr(finding, "find_start", find_start)
     prompt = ("--click", 10, 20, "--region", 0, 0, 40, 40.5, "--depth-range", 0.5, 3)
     tracking = ("--against", "keyframe", "--on", "object", "--min-inliers", 0.5, "--max-angle", 9)
-    mapping = ("--no-realign", "--isotropic", "--min-hits", 2, "--keyframe-angle", 7)
+    mapping = ("--no-realign", "--isotropic", "--fusion", "points", "--min-hits", 2)
+    mapping += ("--keyframe-angle", 7)
     options = ("--poses", "none", "--first", 1, "--seed", 5, "--output", tmp_path)
     status, _, err = run("reconstruct", *linear, scene, *prompt, *tracking, *mapping, *options)
     assert status == 2 and "enough" in err, err
     assert asked["prompt"] == Prompt((10.0, 20.0), (0.0, 0.0, 40.0, 40.5), (0.5, 3.0))
     assert asked["tracking"] == TrackingConfig("keyframe", "object", 0.5, max_angle=9.0)
-    assert asked["mapping"] == MappingConfig(7.0, realign=False, isotropic=True, min_hits=2)
+    assert asked["mapping"] == MappingConfig(
+        7.0, realign=False, isotropic=True, fusion="points", min_hits=2
+    )
     assert asked["options"] == {"box": None, "first": 1, "use_pose": False} and asked["seed"] == 5
 
 
@@ -415,6 +421,24 @@ def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear):
         assert 0 <= results[0][score] <= 1
     assert results[0].pop("seconds") > 0 and results[1].pop("seconds") > 0
     assert results[0] == results[1]
+    seen = {"camera": "kinect", "noise": True, "fusion": "distance"}
+    assert results[0].items() >= seen.items() and results[0]["search"]["objective"] == "soft"
+    assert 0 < results[0]["mesh_measured"] < 1 and 0 < results[0]["symmetry_agreement"] <= 1
+
+
+def test_demo_as_in_the_paper(run, tmp_path, linear):
+    """Clean square images, points in voxels, nothing mirrored."""
+    few = ("--frames", 2, "--method", "encoder")
+    paper = ("--camera", "paper", "--no-symmetry", "--objective", "paper")
+    status, _, err = run("demo", *linear, *few, *paper, "--output", tmp_path)
+    assert status == 0, err
+    result = json.loads((tmp_path / "result.json").read_text())
+    seen = {"camera": "paper", "noise": False, "fusion": "points"}
+    assert result.items() >= seen.items() and result["search"]["objective"] == "paper"
+    assert not result.keys() & {"symmetric", "symmetry_agreement", "mesh_measured"}
+    with np.load(tmp_path / "grid.npz") as grids:
+        F, M, completed = (grids[name] for name in ("occupied", "occluded", "refined"))
+        np.testing.assert_array_equal(grids["composed"], np.where(M, completed, F))
 
 
 def test_evaluate_writes_scores_of_each_mesh_and_their_means(run, chair, tmp_path, linear):
@@ -425,10 +449,42 @@ def test_evaluate_writes_scores_of_each_mesh_and_their_means(run, chair, tmp_pat
     content = json.loads(path.read_text())
     assert set(content) == {"config", "skipped", "per_mesh", "means"}
     assert content["config"]["frames"] == [1, 2] and content["config"]["seconds"] > 0
+    seen = {"camera": "kinect", "noise": True, "fusion": "distance"}
+    assert content["config"].items() >= seen.items()
     assert set(content["means"]) == {"1", "2"}
     assert set(content["means"]["1"]) == {"encoder", "gradient", "bounds"}
     assert content["per_mesh"][0]["frames"] == content["means"]
     assert "encoder" in out and "gradient" in out
+
+
+@pytest.mark.parametrize(
+    "options, expected",
+    [
+        ((), CameraConfig()),
+        (("--noise",), CameraConfig(noise=True)),
+        (
+            ("--camera", "realsense", "--no-noise", "--fusion", "points"),
+            CameraConfig(camera="realsense", noise=False, fusion="points"),
+        ),
+    ],
+)
+def test_the_camera_and_the_switches_of_a_search_reach_the_evaluation(
+    run, chair, tmp_path, linear, monkeypatch, options, expected
+):
+    asked = []
+
+    def evaluate(prior, models, config):
+        asked.append(config)
+        raise OSError("enough.")
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    search = ("--no-symmetry", "--objective", "paper")
+    output = ("--output", tmp_path / "scores.json")
+    assert run("evaluate", *linear, "--meshes", chair, *options, *search, *output)[0] == 2
+    (config,) = asked
+    for name in ("camera", "noise", "fusion"):
+        assert getattr(config, name) == getattr(expected, name)
+    assert config.refine == RefineConfig(objective="paper", symmetry=False)
 
 
 def test_a_killed_evaluation_goes_on_with_the_same_weights_only(

@@ -23,10 +23,11 @@ from orbit_recording import (
 
 from jaxshape.cli import recording as command
 from jaxshape.data.sequences import read_trajectory
-from jaxshape.geometry import fusion
+from jaxshape.geometry.grids import binary
 from jaxshape.mapping.map import mapper as module
 from jaxshape.mapping.map import recording
 from jaxshape.mapping.map.recording import trajectory
+from jaxshape.mapping.map.state import grids_of
 from jaxshape.report import page, panels
 from jaxshape.results.checkpoint import STATE
 
@@ -140,7 +141,7 @@ def test_there_is_one_frame(folder, walk, followed):
 
 def same_shape(ours, theirs):
     """Share of the voxels occupied in one that lie on or beside one occupied in the other."""
-    occupied, other = (np.asarray(fusion.occupied(x.state.measurement)) for x in (ours, theirs))
+    occupied, other = (np.asarray(binary(grids_of(x.state)).occupied) for x in (ours, theirs))
     padded = np.pad(other, 1)
     around = [padded[1 + i : 33 + i, 1 + j : 33 + j, 1 + k : 33 + k]
               for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]  # fmt: skip

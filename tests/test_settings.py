@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.config import DatasetConfig, FaultConfig, InputConfig
 from jaxshape.data.render import SensorNoise
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
@@ -32,11 +33,13 @@ WRONG = {
     InputConfig: {"complete": SHARE, "mirror": SWITCH, "warp": (*SHARE, 1.0)},
     SensorNoise: {"axial": (-1e-3, math.inf), "lateral": (-0.1, math.nan),
                   "quantization": POSITIVE, "dropout": SHARE, "grazing": (-1.0, 181.0)},
+    CameraConfig: {"camera": ("Kinect", ""), "noise": SWITCH, "fusion": ("tsdf",)},
     TrackingConfig: {"against": ("maps", "Map"), "on": ("objects",), "min_inliers": SHARE,
                      "sure_inliers": SHARE, "min_overlap": SHARE, "max_angle": POSITIVE,
                      "max_distance": POSITIVE},
     MappingConfig: {"keyframe_angle": POSITIVE, "keyframe_distance": POSITIVE, "realign": SWITCH,
-                    "isotropic": SWITCH, "min_hits": COUNT, "keyframe_iterations": COUNT},
+                    "isotropic": SWITCH, "fusion": ("point",), "depth_noise": POSITIVE,
+                    "min_hits": COUNT, "keyframe_iterations": COUNT},
     PlacementConfig: {"typical_size": ((0.5, 0.0, 0.5),), "size_spread": ((0.5, math.nan, 0.5),),
                       "yaws": COUNT, "overhangs": ((0.0, -0.2),), "kept": (*COUNT, 1000),
                       "steps": COUNT, "steps_again": COUNT},

@@ -5,12 +5,15 @@ from dataclasses import dataclass, replace
 from functools import wraps
 from typing import Any
 
+import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from jaxshape import process
 from jaxshape.checks import BadSetting
 from jaxshape.cli.common import require
-from jaxshape.data.config import Axis, check_axes
+from jaxshape.data.camera_config import CameraConfig
+from jaxshape.data.config import Axis, CameraName, check_axes
+from jaxshape.geometry.config import FusionName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +27,30 @@ class Axes:
 
     def __post_init__(self) -> None:
         check_axes(self.up, self.front)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """The depth camera, and how its frames are fused."""
+
+    camera: CameraName = "kinect"
+    """Depth camera: the first Kinect (640 x 480 pixels), an Intel RealSense, the LiDAR of an iPhone
+    (256 x 192), or the paper's square images of 96 pixels."""
+    noise: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Give depth images the faults of the camera's sensor, as is done anyway for all cameras but
+    the paper's."""
+    no_noise: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Leave these faults out, as is done anyway for the paper's camera."""
+    fusion: FusionName | None = None
+    """How frames become F and M: `distance` averages signed distances on a fine grid, `points`
+    counts points in voxels (paper). None for points where the paper's camera has no noise, else
+    for distances."""
+
+    def config(self) -> CameraConfig:
+        """The settings, checked."""
+        require(not (self.noise and self.no_noise), "Give --noise or --no-noise, not both.")
+        noise = self.noise or (False if self.no_noise else None)
+        return CameraConfig(camera=self.camera, noise=noise, fusion=self.fusion)
 
 
 @dataclass(frozen=True, kw_only=True)

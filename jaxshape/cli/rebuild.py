@@ -8,7 +8,10 @@ from typing import Annotated, Any
 import tyro
 
 from jaxshape.cli.common import console, require
-from jaxshape.search.config import RefineConfig
+from jaxshape.cli.options import Seen
+from jaxshape.data.camera_config import CameraConfig
+from jaxshape.geometry.config import FusionName
+from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.names import families
 
 VARIANTS = (
@@ -44,9 +47,11 @@ class Rebuild:
         prior = load_prior(self.weights)
         return prior, refiner_for(self.method, prior, self.search), self.search
 
-    def settings(self) -> dict[str, Any]:
-        """Settings of the search for result.json."""
-        return {"method": self.method, "seed": self.seed, "search": asdict(self.search)}
+    def settings(self, fusion: FusionName) -> dict[str, Any]:
+        """Settings of the search for result.json, of grids that are fused in this way."""
+        objective = self.search.objective or objective_for(fusion)
+        search = asdict(self.search) | {"objective": objective}
+        return {"method": self.method, "seed": self.seed, "search": search}
 
 
 def report_objective(result: dict[str, Any]) -> None:
@@ -61,14 +66,19 @@ def report_objective(result: dict[str, Any]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Rebuild):
-    """Rebuild a procedural chair nobody trained on from a noisy orbit of depth frames, and compare
-    with the truth.
+    """Rebuild a procedural chair nobody trained on from frames like a Kinect's along an orbit, and
+    compare with the truth.
 
-    Example: jaxshape demo --seed 3
+    Examples: jaxshape demo --seed 3
+
+    jaxshape demo --camera iphone-lidar --frames 12
+
+    jaxshape demo --camera paper --no-symmetry --objective paper
     """
 
     frames: int = 6
     """Depth frames along the orbit, 20 degrees apart, 1 or more."""
+    seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     output: Path = Path("out/demo")
     """Folder for mesh.glb, mesh.ply, grid.npz, trace.npz, result.json, overview.png and
     report.html."""
@@ -76,47 +86,29 @@ class Demo(Rebuild):
     def run(self) -> None:
         start = time.perf_counter()
         import jax
-        import jax.numpy as jnp
-        import numpy as np
 
-        from jaxshape.data.capture import capture, measure_frames
-        from jaxshape.data.chairs import random_chair
         from jaxshape.data.dataset import TEST_SEEDS
-        from jaxshape.geometry import camera, fusion
         from jaxshape.report.page import write_report
         from jaxshape.report.panels import write_overview
-        from jaxshape.results.output import Observation, write_result
+        from jaxshape.results.output import write_result
         from jaxshape.search.reconstruction import reconstruct_jit, require_measured
 
         require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
         require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
+        seen = self.seen.config()
         prior, refiner, config = self.prepare()
-        mesh = random_chair(TEST_SEEDS + self.seed)
-        # As near as a Kinect's 57 degrees allow: what it measures gets worse with distance squared.
-        T_object_camera = jax.jit(lambda: camera.orbit(self.frames, float(mesh.scale)))()
-        seen = capture(
-            mesh,
-            T_object_camera,
-            noise=True,
-            seed=self.seed,
-            resolution=prior.resolution,
-        )
-        merged = jax.jit(fusion.merge_all)(measure_frames(seen))
-        observation = Observation(
-            depth=list(np.asarray(seen.depth)[:6]),
-            occupied=np.asarray(fusion.occupied(merged)),
-            occluded=np.asarray(fusion.occluded(merged)),
-            frame=seen.frame,
-            T_world_object=np.eye(4),
-            truth=np.asarray(seen.surface),
-        )
+        with console.status("filming a chair"):
+            grids, observation = self.film(seen, prior.resolution)
         require_measured(observation.occupied)
         with console.status("searching the space of shapes"):
-            grids = jnp.asarray(observation.occupied)[None], jnp.asarray(observation.occluded)[None]
             run = reconstruct_jit(refiner, config)
-            found = jax.block_until_ready(run(jax.random.key(self.seed)[None], prior, *grids))
+            key = jax.random.key(self.seed)[None]
+            batch = jax.tree.map(lambda x: x[None], grids)
+            found = jax.block_until_ready(run(key, prior, batch.occupied, batch.occluded))
         figures = {"object": f"procedural chair {TEST_SEEDS + self.seed}", "frames": self.frames}
-        figures |= self.settings() | {"seconds": round(time.perf_counter() - start, 2)}
+        figures |= {"camera": seen.camera, "noise": seen.is_noisy, "fusion": seen.fused_by}
+        figures |= self.settings(seen.fused_by)
+        figures |= {"seconds": round(time.perf_counter() - start, 2)}
         with console.status("drawing"):
             result = write_result(self.output, observation, found, figures)
             write_overview(self.output, observation, found, result)
@@ -126,4 +118,42 @@ class Demo(Rebuild):
         print(
             f"IoU with the true surface: encoder {result['iou_encoder']:.3f}, "
             f"refined {result['iou_refined']:.3f}, composed {result['iou_composed']:.3f}"
+        )
+
+    def film(self, seen: CameraConfig, resolution: int) -> tuple[Any, Any]:
+        """F and M of the chair (`Grids`), and what there is to show of it (`Observation`)."""
+        import jax
+        import numpy as np
+
+        from jaxshape.data.capture import camera_distance, capture, fused_frames, sensor_of
+        from jaxshape.data.chairs import random_chair
+        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.virtual_cameras import virtual_camera
+        from jaxshape.geometry import camera
+        from jaxshape.geometry.fusing import fusion_named
+        from jaxshape.geometry.grids import binary
+        from jaxshape.results.output import Observation
+
+        device, mesh = virtual_camera(seen.camera), random_chair(TEST_SEEDS + self.seed)
+        distance = camera_distance(mesh, device)
+        captured = capture(
+            mesh,
+            jax.jit(lambda: camera.orbit(self.frames, distance))(),
+            noise=seen.is_noisy,
+            seed=self.seed,
+            camera=device,
+            resolution=resolution,
+        )
+        fusing, sensor = fusion_named(seen.fused_by, resolution), sensor_of(device)
+        state, grids = fused_frames(captured, fusing, sensor)
+        shown = binary(grids)
+        return grids, Observation(
+            depth=list(np.asarray(captured.depth)[:6]),
+            occupied=np.asarray(shown.occupied),
+            occluded=np.asarray(shown.occluded),
+            frame=captured.frame,
+            T_world_object=np.eye(4),
+            truth=np.asarray(captured.surface),
+            field=state if seen.fused_by == "distance" else None,
+            sensor=sensor,
         )

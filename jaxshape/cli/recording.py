@@ -59,15 +59,19 @@ class Reconstruct(Rebuild):
     def run(self) -> None:
         start = time.perf_counter()
 
+        import numpy as np
+
         from jaxshape.data.boxes import read_box
         from jaxshape.data.sequences import open_sequence
+        from jaxshape.geometry.grids import binary
         from jaxshape.mapping.map.mapper import build_mapper
         from jaxshape.mapping.map.recording import follow
+        from jaxshape.mapping.map.state import grids_of
         from jaxshape.mapping.placement.finding import find_start
         from jaxshape.mapping.segmentation.segment import Prompt, check_prompt
         from jaxshape.model.weights import fingerprint
         from jaxshape.results.checkpoint import load_state, remove_state, save_state
-        from jaxshape.results.progress import observation_of, write_progress
+        from jaxshape.results.progress import write_progress
         from jaxshape.search.reconstruction import require_measured
 
         require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
@@ -83,7 +87,7 @@ class Reconstruct(Rebuild):
         box = read_box(self.box) if self.box else None
         use_poses = self._use_poses(sequence)
         mapper = build_mapper(prior, refiner, search, self.mapping, self.tracking, seed=self.seed)
-        figures: dict[str, Any] = {"object": str(self.frames), **self.settings()}
+        figures: dict[str, Any] = {"object": str(self.frames), **self.settings(self.mapping.fusion)}
         figures |= {"mapping": asdict(self.mapping), "tracking": asdict(self.tracking)}
         settings = figures | {
             "box": None if box is None else [x.tolist() for x in box],
@@ -95,9 +99,7 @@ class Reconstruct(Rebuild):
         }
         earlier = None
         if not self.fresh:
-            earlier = load_state(
-                self.output, sequence, prior, settings, isotropic=self.mapping.isotropic
-            )
+            earlier = load_state(self.output, sequence, prior, settings, self.mapping)
         if earlier is None:
             with console.status("finding the object"):
                 found = find_start(
@@ -114,7 +116,7 @@ class Reconstruct(Rebuild):
         for note in found.notes:
             console.print(note, highlight=False)
         chosen = range(found.index, len(sequence), self.every)
-        progress, written = earlier, time.perf_counter()
+        progress, next_write = earlier, time.perf_counter() + _SECONDS_BETWEEN_WRITES
         with progress_bar("frames") as bar:
             task = bar.add_task("follow", total=len(chosen), note="")
             for progress in follow(
@@ -130,22 +132,19 @@ class Reconstruct(Rebuild):
                 if progress.logs[-1].status != "keyframe" or progress.shape is None:
                     continue  # what lies in the folder stays until something is measured
                 save_state(self.output, progress, settings)
-                if time.perf_counter() - written > _SECONDS_BETWEEN_WRITES:
-                    seconds = {"seconds": round(time.perf_counter() - start, 2)}
-                    write_progress(
-                        self.output, sequence, progress, figures | seconds, self.mapping.min_hits,
-                        running=True,
-                    )  # fmt: skip
-                    written = time.perf_counter()
+                began = time.perf_counter()
+                if began > next_write:
+                    seconds = {"seconds": round(began - start, 2)}
+                    write_progress(self.output, sequence, progress, figures | seconds, running=True)
+                    took = time.perf_counter() - began
+                    next_write = time.perf_counter() + _SECONDS_BETWEEN_WRITES * max(1.0, 2 * took)
         assert progress is not None  # there is at least the first frame
         with console.status("searching the space of shapes"):
             state, shape = mapper.finish(progress.state)
         progress = progress._replace(state=state, shape=shape)
-        require_measured(observation_of(state, self.mapping.min_hits).occupied)
+        require_measured(np.asarray(binary(grids_of(state)).occupied))
         figures["seconds"] = round(time.perf_counter() - start, 2)
-        result = write_progress(
-            self.output, sequence, progress, figures, self.mapping.min_hits, running=False
-        )
+        result = write_progress(self.output, sequence, progress, figures, running=False)
         self._conclude(progress, result)
         remove_state(self.output)
 
@@ -173,7 +172,7 @@ class Reconstruct(Rebuild):
         from jaxshape.report.panels import write_overview
         from jaxshape.results.progress import observation_of
 
-        observation = observation_of(progress.state, self.mapping.min_hits)
+        observation = observation_of(progress.state)
         with console.status("drawing"):
             write_overview(self.output, observation, progress.shape, result)
             write_report(self.output)

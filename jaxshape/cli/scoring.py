@@ -13,7 +13,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from jaxshape.cli.common import progress_bar, report_skipped, require
-from jaxshape.cli.options import Axes, checked_numbers
+from jaxshape.cli.options import Axes, Seen, checked_numbers
 from jaxshape.files import write_json
 from jaxshape.search.config import RefineConfig
 
@@ -37,8 +37,7 @@ class Evaluate:
     """Numbers of frames to fuse, separated by commas: the first k of an orbit, 20 degrees apart."""
     methods: str = "encoder,gradient,cma"
     """Methods to score, separated by commas; those of `jaxshape reconstruct --method`."""
-    noise: bool = False
-    """Add the faults of a real depth sensor."""
+    seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     ceiling: bool = False
     """Score the best shape of the weights, too: the code fitted to the whole truth."""
     weights: Path | None = None
@@ -56,7 +55,7 @@ class Evaluate:
         config = evaluation.EvaluateConfig(
             frames=checked_numbers(self.frames, "--frames"),
             methods=tuple(self.methods.split(",")),
-            noise=self.noise,
+            **asdict(self.seen.config()),
             ceiling=self.ceiling,
             refine=self.search,
             seed=self.seed,
@@ -134,7 +133,8 @@ def score(
     from jaxshape.results import evaluation
     from jaxshape.results.journal import Journal
 
-    settings = asdict(config) | about
+    resolved = {"noise": config.is_noisy, "fusion": config.fused_by}
+    settings = asdict(config) | resolved | about
     # Beside the results file until that is written.
     partial = output.with_name(output.name + ".partial")
     journal = Journal(partial, settings | {"fingerprint": fingerprint(prior)})
@@ -166,9 +166,12 @@ def score(
 def _print_table(means: dict[str, Any], count: int) -> None:
     from jaxshape.report.card import COLUMNS, rows_of
 
-    table = Table(title=f"means over {count} meshes", title_justify="left")
+    title, padding = f"means over {count} meshes", (0, 1, 0, 0)  # 80 columns hold the table
+    table = Table(title=title, title_justify="left", box=None, padding=padding, pad_edge=False)
     for column in COLUMNS:
-        table.add_column(column, justify="left" if column == "method" else "right")
+        named = column == "method"
+        header = column.replace("-L1", "-\nL1")
+        table.add_column(header, justify="left" if named else "right", no_wrap=named)
     for row in rows_of(means):
         table.add_row(*row)
     Console().print(table)

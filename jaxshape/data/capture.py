@@ -3,7 +3,7 @@
 import math
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +14,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.data import meshes, render
 from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
-from jaxshape.geometry import distance, fusion, grid
+from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.distance import DistanceField
+from jaxshape.geometry.fusing import Distances, Fusion, fuse, fuse_cumulative
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
 
 SURFACE_SAMPLES = 50_000
@@ -141,6 +143,52 @@ def sensor_of(camera: VirtualCamera) -> Sensor:
     return Sensor(axial=math.hypot(camera.noise.axial, step))
 
 
+@partial(jax.jit, static_argnames=("fusing", "numbers", "sensor"))
+def fused_grids(
+    captured: Capture, fusing: Fusion, numbers: tuple[int, ...], sensor: Sensor = Sensor()
+) -> Grids:
+    """F and M of the first k frames of a capture, for each k of an increasing tuple.
+
+    Frames are added one at a time; every pixel that hit something shows the object. Compiled by
+    `jax.jit`.
+
+    Args:
+        captured: Depth frames of an object, from `capture`.
+        fusing: The way to fuse them.
+        numbers: Increasing numbers of frames, 1 or more each.
+        sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
+
+    Returns:
+        Grids `[len(numbers) x y z]`.
+    """
+    depth = jnp.asarray(captured.depth)
+    return fuse_cumulative(
+        fusing,
+        numbers,
+        depth,
+        jnp.isfinite(depth),
+        captured.intrinsics,
+        captured.T_object_camera,
+        captured.frame,
+        sensor,
+    )
+
+
+@partial(jax.jit, static_argnames=("fusing", "sensor"))
+def fused_frames(captured: Capture, fusing: Fusion, sensor: Sensor = Sensor()) -> tuple[Any, Grids]:
+    """All frames of a capture as one state, and its F and M. Compiled by `jax.jit`.
+
+    Args:
+        captured: Depth frames of an object, from `capture`.
+        fusing: The way to fuse them.
+        sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
+    """
+    depth = jnp.asarray(captured.depth)
+    seen, T = jnp.isfinite(depth), captured.T_object_camera
+    state = fuse(fusing, depth, seen, captured.intrinsics, T, captured.frame, sensor)
+    return state, fusing.grids(state)
+
+
 def fuse_frames(
     captured: Capture, frames: tuple[int, ...], sensor: Sensor = Sensor()
 ) -> DistanceField:
@@ -157,17 +205,11 @@ def fuse_frames(
     Returns:
         One field for each number of frames `[len(frames) n n n]`.
     """
-
-    def add(field: DistanceField, frame: tuple[Array, jaxlie.SE3]) -> tuple[DistanceField, None]:
-        depth, T = frame
-        seen = jnp.isfinite(depth)
-        one = distance.measure(depth, seen, captured.intrinsics, T, captured.frame, sensor)
-        return distance.merge(field, one), None
-
-    all_frames = jnp.asarray(captured.depth), captured.T_object_camera
-    field, found = distance.nothing_measured(), []
-    for chosen in (slice(*ends) for ends in pairwise((0, *frames))):
-        some = jax.tree.map(lambda x, chosen=chosen: x[chosen], all_frames)
-        field, _ = jax.lax.scan(add, field, some)
+    depth = jnp.asarray(captured.depth)
+    all_frames = depth, jnp.isfinite(depth), captured.T_object_camera
+    fusing, field, found = Distances(captured.surface.shape[-1]), None, []
+    for ends in pairwise((0, *frames)):
+        depth, seen, T = jax.tree.map(lambda x, ends=ends: x[slice(*ends)], all_frames)
+        field = fuse(fusing, depth, seen, captured.intrinsics, T, captured.frame, sensor, field)
         found.append(field)
     return jax.tree.map(lambda *x: jnp.stack(x), *found)

@@ -32,6 +32,10 @@ FLAT = 1e-6
 """An object is flat when its smallest extent is below this fraction of its largest."""
 
 
+SMALLEST, LARGEST = 0.05, 10.0
+"""Diagonals, in metres, between which an object's size is believed."""
+
+
 class Model(NamedTuple):
     """A CAD model in the canonical object frame.
 
@@ -203,6 +207,24 @@ def canonical(mesh: trimesh.Trimesh, *, up: str = "y", front: str = "z") -> trim
     turned = trimesh.Trimesh(vertices, mesh.faces, process=False)
     turned.vertices -= turned.bounds.mean(axis=0)
     return turned
+
+
+def in_metres(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh, at a size at which a depth camera can see it.
+
+    Many files are in millimetres, inches or no unit at all, and the noise of a depth camera grows
+    with the square of the distance in metres.
+
+    Args:
+        mesh: A mesh in any unit, its box centred at the origin.
+
+    Returns:
+        The mesh itself where its diagonal is that of something in a room, if taken for metres;
+        else the mesh scaled to a diagonal of 1 m.
+    """
+    if SMALLEST <= mesh.scale <= LARGEST:
+        return mesh
+    return trimesh.Trimesh(np.asarray(mesh.vertices) / mesh.scale, mesh.faces, process=False)
 
 
 def axes_to_canonical(up: str, front: str) -> Float[np.ndarray, "3 3"]:

@@ -61,7 +61,7 @@ def draw_path(mesh: trimesh.Trimesh, config: DatasetConfig, seed: int) -> Path:
     """
     rng = np.random.default_rng(seed)
     name = config.cameras[rng.integers(len(config.cameras))]
-    kind = CAMERAS[name]
+    kind, mesh = CAMERAS[name], meshes.in_metres(mesh)
     poses = draw_poses(mesh, kind, config, rng)
     intrinsics, size = render.window(kind, mesh, poses, GRID_MARGIN)
     depth, cosine = render.render_depth(mesh, poses, intrinsics, size)

@@ -97,6 +97,12 @@ def as_grids(evidence: Evidence) -> Grids:
     return Grids(evidence.surface / jnp.where(known > 0, known, 1), 1 - known)
 
 
+def from_grids(grids: Grids) -> Evidence:
+    """Probabilities of surface and free space in F and M, binary or soft: undoes `as_grids`."""
+    F, M = (jnp.asarray(x).astype(jnp.float32) for x in (grids.occupied, grids.occluded))
+    return Evidence(F * (1 - M), (1 - F) * (1 - M))
+
+
 def soft_grids(field: DistanceField, resolution: int = RESOLUTION) -> Grids:
     """F and M as probabilities, from fused signed distances.
 

@@ -8,9 +8,10 @@ distances on a fine grid, for depth that is real or noisy. Both are static under
     grids = fusing.grids(state)
 """
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,14 +21,13 @@ from jaxtyping import Array, Bool, Float
 from jaxshape import checks
 from jaxshape.geometry import distance, fusion
 from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.config import FusionName
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.evidence import soft_grids
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import RESOLUTION, GridFrame
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
-
-FusionName = Literal["distance", "points"]
 
 
 @jax.tree_util.register_static
@@ -78,8 +78,8 @@ class Distances:
 
     Attributes:
         resolution: Voxels along each axis of F and M.
-        fine: Voxels along each axis of the fine grid, a multiple of the resolution; None for 4
-            times 32 (or the resolution, where that is more).
+        fine: Voxels along each axis of the fine grid, a multiple of the resolution; None for the
+            least multiple that is 4 times 32 or more.
 
     Raises:
         ValueError: The fine grid is not a multiple of the other.
@@ -95,7 +95,9 @@ class Distances:
 
     @property
     def _side(self) -> int:
-        return self.fine or max(self.resolution, distance.FINE * RESOLUTION)
+        if self.fine is not None:
+            return self.fine
+        return self.resolution * math.ceil(distance.FINE * RESOLUTION / self.resolution)
 
     def nothing(self) -> DistanceField:
         """The field of no frames."""
@@ -158,6 +160,7 @@ def fuse(
         T_object_camera: Pose of each frame in the object frame `[frame]`.
         frame: Voxel frame of F and M.
         sensor: How the camera's noise grows.
+        state: The state of earlier frames; None where there are none.
     """
 
     merge: Any = fusing.merge  # of either kind, and so is the state

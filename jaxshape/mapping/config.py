@@ -60,8 +60,12 @@ class MappingConfig:
         realign: Realign all keyframes with the refined shape after each new one.
         isotropic: Scale all axes of the grid alike, as the paper does on real data, instead of
             filling the box.
-        min_hits: Depth points that make a voxel occupied, 1 or more (paper: 1). More suppress stray
-            points.
+        fusion: How keyframes are fused: `distance` averages signed distances on a fine grid, which
+            takes the noise of depth away; `points` counts measured points in voxels (paper).
+        depth_noise: Standard deviation of the camera's depth, above 0, in metres at 1 m; it grows
+            with the square of depth. The default is that of the first Kinect. For `distance`.
+        min_hits: For `points`: depth points that make a voxel occupied, 1 or more (paper: 1). More
+            suppress stray points.
         keyframe_iterations: Steps of the search after each keyframe, from the code found so far, 1
             or more.
 
@@ -73,6 +77,8 @@ class MappingConfig:
     keyframe_distance: float = 0.25
     realign: bool = True
     isotropic: bool = False
+    fusion: Literal["distance", "points"] = "distance"
+    depth_noise: float = 1.6e-3
     min_hits: int = 3
     keyframe_iterations: int = 40
 
@@ -81,5 +87,7 @@ class MappingConfig:
         checks.positive("keyframe_distance", self.keyframe_distance, "metres")
         for switch in ("realign", "isotropic"):
             checks.one_of(switch, getattr(self, switch), (True, False))
+        checks.one_of("fusion", self.fusion, ("distance", "points"))
+        checks.positive("depth_noise", self.depth_noise, "metres")
         checks.whole("min_hits", self.min_hits, 1)
         checks.whole("keyframe_iterations", self.keyframe_iterations, 1)

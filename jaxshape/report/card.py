@@ -22,7 +22,10 @@ from jaxshape.model.pca import PCA
 from jaxshape.model.training import Report
 from jaxshape.process import processor
 
-COLUMNS = ("frames", "method", "IoU", "IoU composed", "Chamfer-L1", "F-score", "objective")
+COLUMNS = (
+    "frames", "method", "IoU", "IoU composed", "IoU occluded", "nats occluded", "Chamfer-L1",
+    "F-score", "objective",
+)  # fmt: skip
 
 
 _BOUNDS = {"occluded_empty": "F", "occluded_full": "F or M", "ceiling": "ceiling"}
@@ -199,16 +202,25 @@ def _run(card: dict[str, Any]) -> dict[str, str]:
 def _figures(scores: dict[str, Any] | None) -> str:
     if scores is None:
         return "None yet: score the weights on meshes that were held out, `jaxshape evaluate`."
+    config = scores["config"]
     return f"""Means over the meshes held out of training, {len(scores["per_mesh"])} of the same \
 folder; first k frames of an orbit at
-30 degrees elevation, no noise, {scores["config"]["refine"]["iterations"]} iterations:
+30 degrees elevation, {_seen(config)}; {config["refine"]["iterations"]} iterations:
 
 {markdown_table(scores["means"])}
 
 IoU, Chamfer-L1 (a fraction of the bounding-box diagonal) and F-score (at 1 % of the grid's side)
 are of the decoded shape; the composed one keeps what was measured and fills in only what was
-occluded. F is the measurement alone, F or M the same with all that was occluded filled in. Single
-meshes are in evaluation.json."""
+occluded. IoU occluded is of the occluded voxels alone, nats occluded their cross-entropy. F is the
+measurement alone, F or M the same with all that was occluded filled in. Single meshes are in
+evaluation.json."""
+
+
+def _seen(config: dict[str, Any]) -> str:
+    """The camera of an evaluation, and how its frames were fused."""
+    noise = "with noise" if config["noise"] else "without noise"
+    fused = "signed distances" if config["fusion"] == "distance" else "points in voxels"
+    return f"camera {config['camera']} {noise}, fused as {fused}"
 
 
 def _limits(card: dict[str, Any], scores: dict[str, Any] | None) -> Iterator[str]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxshape.report.paint import paints
 from jaxshape.report.palette import LAYERS
 from jaxshape.report.panels import Panel, depth_panels, grid_panel, measurement_panel
 from jaxshape.report.pictures import render_mesh
@@ -60,6 +61,7 @@ def scene(found: ResultFolder) -> dict[str, Any]:
         geometry["mesh"] = {
             "vertices": _base64(mesh.vertices, "<f4"),
             "faces": _base64(mesh.faces, "<u4"),
+            "paints": {name: _base64(paint.colors, "u1") for name, paint in paints(found).items()},
         }
     for name, voxels in found.grids.items():
         geometry[name] = {"voxels": _base64(np.packbits(voxels), "u1")}
@@ -118,7 +120,9 @@ def still(found: ResultFolder) -> Picture | None:
     mesh = mesh_in_object(found)
     if mesh is None:
         return None
-    image = render_mesh(mesh, color=LAYERS["mesh"].color, size=480)
+    first = next(iter(paints(found).values()), None)
+    color = LAYERS["mesh"].color if first is None else first.colors
+    image = render_mesh(mesh, color=color, size=480)
     return Picture("mesh", _png(image), "The rebuilt mesh, from the front, right and above")
 
 

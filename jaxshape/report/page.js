@@ -37,7 +37,9 @@ function meshGeometry(layer) {
   }
   const gather = (from) => Float32Array.from({ length: 3 * faces.length },
     (_, i) => from[3 * faces[Math.floor(i / 3)] + (i % 3)]);
-  return { positions: gather(vertices), normals: gather(normals) };
+  const paint = layer.paints[layer.paint];
+  const colors = paint && gather(new Uint8Array(bytes(paint))).map((part) => part / 255);
+  return { positions: gather(vertices), normals: gather(normals), colors };
 }
 
 /** The faces of a grid's voxels that lie open, in voxel coordinates; bits are indexed [x, y, z]. */
@@ -81,12 +83,13 @@ function lineGeometry(layer) {
 // ---------------------------------------------------------------- drawing
 
 const VERTEX = `#version 300 es
-in vec3 position, normal;
+in vec3 position, normal, paint;
 uniform mat4 clip_from_object;
 uniform mat3 view;
 uniform vec3 origin, scale;
-out vec3 place, facing;
+out vec3 place, facing, painted;
 void main() {
+  painted = paint;
   place = position;
   facing = view * (normal / scale);
   gl_Position = clip_from_object * vec4(origin + scale * position, 1.0);
@@ -95,9 +98,9 @@ void main() {
 // The light and the dark edges of pictures.py.
 const FRAGMENT = `#version 300 es
 precision highp float;
-in vec3 place, facing;
+in vec3 place, facing, painted;
 uniform vec4 color;
-uniform bool voxels;
+uniform bool voxels, is_painted;
 out vec4 shown;
 void main() {
   float brightness = 1.0;
@@ -110,7 +113,8 @@ void main() {
     float second = max(min(border.x, border.y), min(max(border.x, border.y), border.z));
     if (second > 0.44) brightness *= 0.86;
   }
-  shown = vec4(color.rgb * brightness * color.a, color.a);
+  vec3 base = is_painted ? painted : color.rgb;
+  shown = vec4(base * brightness * color.a, color.a);
 }`;
 
 function compile() {
@@ -134,7 +138,9 @@ function upload(program, layer) {
   layer.count = geometry.positions.length / 3;
   layer.array = gl.createVertexArray();
   gl.bindVertexArray(layer.array);
-  for (const [name, data] of [["position", geometry.positions], ["normal", geometry.normals]]) {
+  const data_of = { position: geometry.positions, normal: geometry.normals, paint: geometry.colors };
+  for (const [name, data] of Object.entries(data_of)) {
+    if (!data) continue;
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
     const place = gl.getAttribLocation(program, name);
@@ -184,6 +190,7 @@ function draw(program) {
     const color = [1, 3, 5].map((i) => parseInt(layer.color.slice(i, i + 2), 16) / 255);
     gl.uniform4f(set("color"), ...color, layer.opacity);
     gl.uniform1i(set("voxels"), Boolean(layer.voxels));
+    gl.uniform1i(set("is_painted"), Boolean(layer.paints?.[layer.paint]));
     gl.uniform3fv(set("origin"), layer.voxels ? scene.origin : [0, 0, 0]);
     gl.uniform3fv(set("scale"), layer.voxels ? scene.voxel_size : [1, 1, 1]);
     gl.depthMask(layer.opacity === 1);
@@ -268,9 +275,18 @@ function listen(redraw) {
       redraw();
     });
   }
+  const choice = document.getElementById("paint");
+  choice?.addEventListener("change", () => {
+    const mesh = scene.layers.find((layer) => layer.name === "mesh");
+    mesh.paint = choice.value;
+    mesh.array = null; // handed over anew
+    redraw();
+  });
 }
 
 function start() {
+  for (const layer of scene.layers.filter((layer) => layer.paints))
+    layer.paint = document.getElementById("paint")?.value;
   const program = compile();
   let asked = false;
   const redraw = () => {

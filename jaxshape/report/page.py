@@ -17,6 +17,7 @@ from typing import Any
 from jaxshape.files import write_text
 from jaxshape.report import illustrations, tables
 from jaxshape.report.illustrations import Picture
+from jaxshape.report.paint import paints
 from jaxshape.report.palette import LAYERS
 from jaxshape.results.folder import ResultFolder, read_folder
 from jaxshape.results.summary import headline, tracked, warnings_of
@@ -107,6 +108,11 @@ def _shape(found: ResultFolder, scene: dict[str, Any]) -> str:
         for layer in scene["layers"]
         for name in [layer["name"]]
     )
+    choices = "".join(
+        f'<option value="{name}">{escape(paint.label)}</option>'
+        for name, paint in paints(found).items()
+    )
+    paint = f'<label>mesh in <select id="paint">{choices}</select></label>' if choices else ""
     views = {"oblique": "35 25", "front": "0 0", "side": "90 0", "back": "180 0", "top": "0 89"}
     buttons = "".join(f'<button data-view="{at}">{name}</button>' for name, at in views.items())
     picture = illustrations.still(found)
@@ -114,7 +120,7 @@ def _shape(found: ResultFolder, scene: dict[str, Any]) -> str:
     return f"""<section><h2>The shape</h2>
 <div id="shape">{still}<canvas id="turnable" tabindex="0" role="img"
 aria-label="The shape in 3D; arrow keys turn it, plus and minus zoom"></canvas></div>
-<div class="controls">{boxes}</div><div class="controls">{buttons}</div>
+<div class="controls">{boxes}{paint}</div><div class="controls">{buttons}</div>
 <p class="soft hands">Drag to turn, Shift-drag or two fingers to shift, wheel (once clicked) or
 pinch to zoom.</p></section>"""
 

@@ -10,10 +10,11 @@ import trimesh
 from jaxtyping import Bool, Float, Integer, UInt8
 
 from jaxshape.files import atomic_path
+from jaxshape.report.paint import paints
 from jaxshape.report.palette import COLORS, INK, PALE
 from jaxshape.report.pictures import render_measurement, render_mesh, render_voxels, rgb
-from jaxshape.results.output import SMOOTHING, Observation, only
-from jaxshape.results.surface import surface
+from jaxshape.results.folder import mesh_in_object, read_folder
+from jaxshape.results.output import Observation, only
 from jaxshape.search.reconstruction import Reconstruction
 
 _WIDTH, _GAP, _TEXT, _CELL = 1600, 16, 34, 400  # pixels
@@ -53,9 +54,15 @@ def measurement_panel(
     return Panel(title, render_measurement(occupied, occluded, size=_CELL), note)
 
 
-def mesh_panel(title: str, mesh: trimesh.Trimesh, color: str, note: str = "") -> Panel:
-    """Picture a mesh in an entry of `COLORS`."""
-    return Panel(title, render_mesh(mesh, color=COLORS[color], size=_CELL), note)
+def mesh_panel(
+    title: str,
+    mesh: trimesh.Trimesh,
+    color: str | UInt8[np.ndarray, "n 3"],
+    note: str = "",
+) -> Panel:
+    """Picture a mesh in an entry of `COLORS`, or in the colours of its vertices."""
+    paint = COLORS[color] if isinstance(color, str) else color
+    return Panel(title, render_mesh(mesh, color=paint, size=_CELL), note)
 
 
 def depth_panels(depth_frames: Sequence[Float[np.ndarray, "_ _"]]) -> list[Panel]:
@@ -86,7 +93,7 @@ def write_overview(
     """Write `overview.png` of ONE object: depth images above, grids and the mesh below.
 
     Args:
-        folder: The result folder.
+        folder: The result folder, which holds the mesh already.
         observation: Measurement of the object.
         reconstruction: The reconstruction, a batch of one.
         result: The content of result.json; its IoUs are noted below the grids.
@@ -96,15 +103,18 @@ def write_overview(
     def note(name: str) -> str:
         return f"IoU {result[name]:.2f}" if name in result else ""
 
-    composed = np.where(observation.occluded, 2 * one.composed, observation.occupied.astype(int))
-    mesh = surface(one.composed, observation.frame, smoothing=SMOOTHING)
+    composed = np.where(one.composed, np.where(observation.occluded, 2, 1), 0)
+    found = read_folder(folder)
     columns = [
         measurement_panel("F (blue) and M", observation.occupied, observation.occluded),
         grid_panel("encoder", one.completed_first, "predicted", note=note("iou_encoder")),
         grid_panel("refined", one.completed, "predicted", note=note("iou_refined")),
         grid_panel("composed", composed, "measured", "predicted", note=note("iou_composed")),
-        mesh_panel("mesh", mesh, "predicted"),
     ]
+    mesh = mesh_in_object(found)
+    if mesh is not None:
+        first = next(iter(paints(found).values()), None)
+        columns.append(mesh_panel("mesh", mesh, "predicted" if first is None else first.colors))
     if observation.truth is not None:
         columns.append(grid_panel("truth", observation.truth, "truth"))
     write_panels(Path(folder) / "overview.png", [depth_panels(observation.depth), columns])

@@ -181,14 +181,15 @@ def render_measurement(
 def render_mesh(
     mesh: trimesh.Trimesh,
     *,
-    color: str = COLORS["predicted"],
+    color: str | UInt8[np.ndarray, "n 3"] = COLORS["predicted"],
     size: int = 256,
     azimuth: float = AZIMUTH,
     elevation: float = ELEVATION,
 ) -> UInt8[np.ndarray, "size size 3"]:
     """Draw a mesh, smoothly shaded and scaled to fill the picture, by casting a ray per pixel.
 
-    A mesh without faces gives a white picture. Fast where `embreex` is installed.
+    `color` is one as `#rrggbb`, or one for each vertex. A mesh without faces gives a white picture.
+    Fast where `embreex` is installed.
     """
     pixels = size * _SUPERSAMPLING
     canvas = np.ones((pixels * pixels, 3))
@@ -210,5 +211,8 @@ def render_mesh(
     normals = np.einsum("nk,nkd->nd", corners, mesh.vertex_normals[mesh.faces[faces]]) @ view.T
     normals *= np.where(normals[:, 2:] < 0, -1, 1)  # open surfaces are seen from either side
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    canvas[rays] = rgb(color) * _brightness(normals)[:, None]
+    paint = rgb(color) if isinstance(color, str) else np.einsum(
+        "nk,nkd->nd", corners, color[mesh.faces[faces]] / 255
+    )  # fmt: skip
+    canvas[rays] = paint * _brightness(normals)[:, None]
     return _to_image(canvas.reshape(pixels, pixels, 3))

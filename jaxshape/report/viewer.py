@@ -17,7 +17,9 @@ import viser  # pyright: ignore[reportMissingImports] - of the extra `viewer`
 import viser.transforms  # pyright: ignore[reportMissingImports]
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
+from trimesh.visual import ColorVisuals
 
+from jaxshape.report.paint import Paint, paints
 from jaxshape.report.palette import LAYERS
 from jaxshape.results.folder import (
     KeyframeRecord,
@@ -32,7 +34,8 @@ from jaxshape.results.folder import (
 )
 from jaxshape.results.summary import headline, tracked, warnings_of
 
-WATCHED = ("mesh.glb", "grid.npz", "keyframes.json", "result.json")
+WATCHED = ("mesh.ply", "grid.npz", "keyframes.json", "result.json")
+PLAIN = "one colour"
 SECONDS_BETWEEN_LOOKS = 0.5
 LINES: Any = {"thickness": 2.0, "thickness_units": "screen"}
 
@@ -85,6 +88,8 @@ class LiveView:
             for name, layer in LAYERS.items():
                 self.boxes[name] = gui.add_checkbox(layer.label, layer.shown)
                 self.boxes[name].on_update(lambda _: self._show())
+            self.paint = gui.add_dropdown("Mesh in", (PLAIN,), visible=False)
+            self.paint.on_update(lambda _: self._scene())
         with gui.add_folder("Keyframe") as self.keyframes:
             self.slider = gui.add_slider("number", 0, 1, 1, 1)
             self.slider.on_update(lambda _: self._choose())
@@ -135,7 +140,7 @@ class LiveView:
 
     def _scene(self) -> None:
         """Draw what is new or different, and take away what is no longer there."""
-        nodes = _nodes(self.server.scene, self.found)
+        nodes = _nodes(self.server.scene, self.found, self._paint())
         for name in set(self._drawn) - set(nodes):
             self._drawn.pop(name)[1].remove()
         for name, (content, draw) in nodes.items():
@@ -148,6 +153,14 @@ class LiveView:
             start = self.server.initial_camera
             start.look_at, start.fov = center, np.radians(45.0)
             start.position = center + 4.5 * radius * np.array([0.52, 0.42, 0.74])
+
+    def _paint(self) -> Paint | None:
+        """The chosen colours of the mesh, of those there are."""
+        there = {paint.label: paint for paint in paints(self.found).values()}
+        if tuple(there) != self.paint.options and there:
+            self.paint.options = tuple(there)
+        self.paint.visible = bool(there)
+        return there.get(self.paint.value)
 
     def _show(self) -> None:
         """Show the layers that are ticked, and boxes for the layers there are."""
@@ -200,12 +213,16 @@ def _html(lines: list[str]) -> str:
 # ------------------------------------------------------------------ nodes of the scene
 
 
-def _nodes(scene: viser.SceneApi, found: ResultFolder) -> dict[str, tuple[bytes, Draw]]:
+def _nodes(
+    scene: viser.SceneApi, found: ResultFolder, paint: Paint | None
+) -> dict[str, tuple[bytes, Draw]]:
     """Nodes by name: the bytes that identify the content of each, and how to draw it."""
     nodes: dict[str, tuple[bytes, Draw]] = {}
     mesh, path = mesh_in_object(found), found.trajectory
     if mesh is not None:
-        nodes["/mesh"] = mesh.vertices.tobytes() + mesh.faces.tobytes(), partial(_mesh, scene, mesh)
+        content = mesh.vertices.tobytes() + mesh.faces.tobytes()
+        content += b"" if paint is None else paint.colors.tobytes()
+        nodes["/mesh"] = content, partial(_mesh, scene, mesh, paint)
     for name, grid in found.grids.items():
         content = grid.tobytes() + found.origin.tobytes() + found.voxel_size.tobytes()
         if grid.any():
@@ -222,7 +239,10 @@ def _layer(name: str) -> str:
     return name.split("/")[1]
 
 
-def _mesh(scene: viser.SceneApi, mesh: trimesh.Trimesh) -> Any:
+def _mesh(scene: viser.SceneApi, mesh: trimesh.Trimesh, paint: Paint | None) -> Any:
+    if paint is not None:
+        mesh.visual = ColorVisuals(mesh, vertex_colors=paint.colors)
+        return scene.add_mesh_trimesh("/mesh", mesh)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     return scene.add_mesh_simple("/mesh", vertices, faces, color=_rgb("mesh"), side="double")
 

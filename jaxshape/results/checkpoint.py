@@ -16,18 +16,12 @@ import numpy as np
 from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.files import atomic_path
+from jaxshape.mapping.config import MappingConfig
 from jaxshape.mapping.map.recording import FrameLog, Progress
 from jaxshape.mapping.map.state import MapState, assemble
 from jaxshape.mapping.placement.finding import Start, room
 from jaxshape.mapping.placement.placing import Placement
-from jaxshape.mapping.tracking.keyframes import (
-    Keyframe,
-    Place,
-    PreparedFrame,
-    keyframe_of,
-    place_of,
-    prepare,
-)
+from jaxshape.mapping.tracking.keyframes import Keyframe, keyframe_of, place_of, prepare
 from jaxshape.model.shapes import ShapePrior
 
 STATE = "state.npz"
@@ -91,8 +85,7 @@ def load_state(
     sequence: Sequence,
     prior: ShapePrior,
     settings: dict[str, Any],
-    *,
-    isotropic: bool,
+    mapping: MappingConfig,
 ) -> Progress | None:
     """The progress of a run that was cut short.
 
@@ -101,7 +94,7 @@ def load_state(
         sequence: The recording of the run.
         prior: The shape prior of the run.
         settings: Settings of the run, as given to `save_state`.
-        isotropic: Whether all axes of the grid have one scale.
+        mapping: Settings of mapping of the run.
 
     Returns:
         The progress; None where there is none.
@@ -130,8 +123,7 @@ def load_state(
         FrameLog(*log)._replace(T_keyframe_camera=None if np.isnan(T).any() else T)
         for log, T in zip(about["logs"], kept["T_keyframe_camera"], strict=True)
     )
-    place = place_of(start.box, prior.resolution, room(start), isotropic=isotropic)
-    return Progress(_state(kept, about, start, place, logs, sequence, prior), start, logs)
+    return Progress(_state(kept, about, start, logs, sequence, prior, mapping), start, logs)
 
 
 def _start(kept: dict[str, np.ndarray], about: dict[str, Any]) -> Start:
@@ -153,13 +145,15 @@ def _start(kept: dict[str, np.ndarray], about: dict[str, Any]) -> Start:
 
 
 def _state(
-    kept, about, start: Start, place: Place, logs, sequence: Sequence, prior: ShapePrior
+    kept, about, start: Start, logs, sequence: Sequence, prior: ShapePrior, mapping: MappingConfig
 ) -> MapState:
+    place = place_of(start.box, prior.resolution, room(start), isotropic=mapping.isotropic)
     indices = [log.index for log in logs if log.status == "keyframe"]
     keyframes: list[Keyframe] = []
     view = None
     for number, index in enumerate(indices):
-        view = prepare(sequence[index], sequence.intrinsics).view
+        prepared = prepare(sequence[index], sequence.intrinsics)
+        view = prepared.view
         masked, segmented = (
             jnp.asarray(np.unpackbits(packed, axis=-1, count=view.depth.shape[1]).astype(bool))
             for packed in (kept[f"keyframes.{name}"][number] for name in ("masked", "segmented"))
@@ -170,13 +164,15 @@ def _state(
         )
         information = jnp.asarray(kept["keyframes.information"][number])
         odometry = T_previous, information
-        keyframes.append(keyframe_of(PreparedFrame(view, masked), place, T, odometry, segmented))
+        prepared = prepared._replace(masked=masked)
+        keyframes.append(keyframe_of(prepared, place, T, odometry, segmented))
     assert view is not None
     return assemble(
         prior,
         place,
         tuple(keyframes),
         view,
+        mapping,
         code=jnp.asarray(kept["code"]),
         logits=jnp.asarray(kept["logits"]),
         T_world_camera=jaxlie.SE3(jnp.asarray(kept["T_world_camera"])),

@@ -9,14 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Key
 
-from jaxshape.data.capture import camera_distance, capture, measure_frames
+from jaxshape.data.camera_config import CameraConfig
+from jaxshape.data.capture import camera_distance, capture, fused_grids, sensor_of
 from jaxshape.data.dataset import hash_seed
-from jaxshape.data.meshes import Model, Skipped
-from jaxshape.geometry import camera, fusion
+from jaxshape.data.meshes import Model, Skipped, in_metres
+from jaxshape.data.virtual_cameras import virtual_camera
+from jaxshape.geometry import camera
+from jaxshape.geometry.fusing import fusion_named
 from jaxshape.geometry.grid import RESOLUTION
+from jaxshape.geometry.grids import Grids, binary
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
-from jaxshape.results.metrics import bounds, shape_scores
+from jaxshape.results.metrics import bounds, occluded_scores, shape_scores
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import (
     Reconstruction,
@@ -31,13 +35,17 @@ OBJECTS_AT_A_TIME = 16
 
 
 @dataclass(frozen=True)
-class EvaluateConfig:
+class EvaluateConfig(CameraConfig):
     """Settings of an evaluation, besides the meshes and the weights.
 
     Attributes:
         frames: Numbers of frames to fuse, each 1 or more: the first k of the orbit.
         methods: Names of the searches, see `jaxshape.search.methods`; "encoder" searches nothing.
-        noise: Add the faults of a real sensor to the depth images.
+        camera: Name of the depth camera, see `jaxshape.data.virtual_cameras`.
+        noise: Give the depth images the faults of the camera's sensor; None for all but the paper's
+            camera.
+        fusion: How frames become F and M, "distance" or "points"; None for points where the paper's
+            camera has no noise, distances elsewhere.
         ceiling: Add to the bounds the best that the space could hold, `fit_surface`, whatever was
             seen.
         refine: Settings of the searches.
@@ -46,7 +54,6 @@ class EvaluateConfig:
 
     frames: tuple[int, ...] = (1, 4, 8, 18)
     methods: tuple[str, ...] = ("encoder", "gradient", "cma")
-    noise: bool = False
     ceiling: bool = False
     refine: RefineConfig = field(default_factory=RefineConfig)
     seed: int = 0
@@ -59,13 +66,11 @@ class Case(NamedTuple):
     """One object after one number of frames; batched over both.
 
     Attributes:
-        occupied: F `[*case x y z]`.
-        occluded: M `[*case x y z]`.
+        grids: F and M `[*case x y z]`: binary from points, soft from signed distances.
         surface: True surface voxels `[*case x y z]`.
     """
 
-    occupied: Bool[Array, "*case x y z"]
-    occluded: Bool[Array, "*case x y z"]
+    grids: Grids
     surface: Bool[Array, "*case x y z"]
 
 
@@ -73,25 +78,31 @@ def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) 
     """Fuse the first k frames of an orbit at 30 degrees elevation, for every k of the settings.
 
     Args:
-        model: The mesh.
+        model: The mesh, in metres; of no object's size, it is scaled to a diagonal of 1 m.
         config: Settings of the evaluation.
         resolution: Voxels along each axis of the grids.
 
     Returns:
         The grids; None where some number of frames measured nothing.
     """
-    mesh = model.mesh
+    mesh, device = in_metres(model.mesh), virtual_camera(config.camera)
     # Independent of the other meshes, so that a mesh scores the same in any company.
     seed = hash_seed(config.seed, *model.name.encode())
-    T_object_camera = camera.orbit(max(config.frames), camera_distance(mesh))
-    captured = capture(mesh, T_object_camera, noise=config.noise, seed=seed, resolution=resolution)
-    merged = fusion.merge_cumulative(measure_frames(captured))
-    chosen = jax.tree.map(lambda x: x[np.array(config.frames) - 1], merged)
-    occupied = fusion.occupied(chosen)
-    if not all_measured(occupied):
+    captured = capture(
+        mesh,
+        camera.orbit(max(config.frames), camera_distance(mesh, device)),
+        noise=config.is_noisy,
+        seed=seed,
+        camera=device,
+        resolution=resolution,
+    )
+    fusing, numbers = fusion_named(config.fused_by, resolution), tuple(sorted(config.frames))
+    grids = fused_grids(captured, fusing, numbers, sensor_of(device))
+    if not all_measured(binary(grids).occupied):
         return None
-    surface = jnp.broadcast_to(captured.surface, occupied.shape)
-    return Case(occupied, fusion.occluded(chosen), surface)
+    order = np.array([numbers.index(k) for k in config.frames])
+    grids = jax.tree.map(lambda x: x[order], grids)
+    return Case(grids, jnp.broadcast_to(captured.surface, grids.occupied.shape))
 
 
 def evaluate(
@@ -126,7 +137,7 @@ def evaluate(
         keys = jnp.concatenate([case_keys(m.name, config.frames, config.seed) for m, _ in seen])
         cases = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in seen])
         keys, filled = jax.tree.map(lambda x: fill(x, size), (keys, cases))
-        found = jax.device_get(run(keys, prior, filled.occupied, filled.occluded))
+        found = jax.device_get(run(keys, prior, filled.grids))
         found = {name: found[name] for name in config.methods}  # JAX has sorted the names
         cases = jax.device_get(cases)
         ceilings = None
@@ -163,9 +174,10 @@ def by_each_method(
     refiners = {name: refiner_for(name, prior, config.refine) for name in config.methods}
 
     @jax.jit
-    def run(keys, prior, occupied, occluded):
+    def run(keys, prior, grids):
+        F, M = grids.occupied, grids.occluded
         return {
-            name: reconstruct(keys, prior, occupied, occluded, refiner, config.refine)
+            name: reconstruct(keys, prior, F, M, refiner, config.refine)
             for name, refiner in refiners.items()
         }
 
@@ -186,14 +198,18 @@ def _scores(case: Case, found: dict[str, Any], row: int) -> dict[str, Any]:
     scores: dict[str, Any] = {}
     for method, result in found.items():
         shape = shape_scores(result.completed[row], case.surface)
+        hidden = occluded_scores(result.fill_logits[row], case.grids.occluded, case.surface)
         scores[method] = {
             "iou": shape.iou,
             "iou_composed": float(iou(result.composed[row], case.surface)),
+            "iou_occluded": float(hidden.iou),
+            "cross_entropy_occluded": float(hidden.cross_entropy),
             "chamfer_l1": shape.chamfer_l1,
             "f_score": shape.f_score,
             "objective": float(result.objective[row]),
         }
-    limits = bounds(case.occupied, case.occluded, case.surface)
+    occupied, occluded, _ = binary(case.grids)
+    limits = bounds(occupied, occluded, case.surface)
     scores["bounds"] = {name: float(value) for name, value in limits._asdict().items()}
     return scores
 

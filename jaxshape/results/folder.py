@@ -14,6 +14,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, UInt8
 
+from jaxshape.results.surface import read_ply
+
 GRIDS = ("occupied", "occluded", "encoder", "refined", "composed", "truth")
 IMAGES = ("image", "depth", "mask")
 
@@ -41,6 +43,8 @@ class ResultFolder(NamedTuple):
         name: Name of the folder.
         result: Content of result.json.
         mesh: Mesh in the world frame, in metres.
+        measured: True for its vertices on the measured surface; None where that is not known.
+        color: Colours of its vertices; None where it has none.
         grids: Grids of `GRIDS` that are there.
         origin: Object-frame position of voxel coordinate (0, 0, 0), in metres.
         voxel_size: Edge lengths of one voxel, in metres.
@@ -56,6 +60,8 @@ class ResultFolder(NamedTuple):
     name: str
     result: dict[str, Any]
     mesh: trimesh.Trimesh | None
+    measured: Bool[np.ndarray, " n"] | None
+    color: UInt8[np.ndarray, "n 3"] | None
     grids: dict[str, Bool[np.ndarray, "x y z"]]
     origin: Float[np.ndarray, " 3"]
     voxel_size: Float[np.ndarray, " 3"]
@@ -98,10 +104,13 @@ def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
     grids, frame = read("grid.npz", _grids, ({}, None))
     origin, voxel_size, T_world_object = frame or _stand_in(keyframes)
     T_object_world = np.linalg.inv(T_world_object)
+    mesh, measured, color = read("mesh.ply", read_ply, (None, None, None))
     return ResultFolder(
         name=folder.resolve().name,
         result=read("result.json", _object, {}),
-        mesh=read("mesh.glb", _mesh, None),
+        mesh=mesh,
+        measured=measured,
+        color=color,
         grids=grids,
         origin=origin,
         voxel_size=voxel_size,
@@ -174,13 +183,6 @@ def _object(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"a JSON object is expected, but it holds a {type(content).__name__}")
     return content
-
-
-def _mesh(path: Path) -> trimesh.Trimesh:
-    mesh = trimesh.load_mesh(path)
-    if not np.isfinite(mesh.vertices).all() or len(mesh.faces) == 0:
-        raise ValueError("it has no faces, or vertices that are not finite")
-    return mesh
 
 
 def _grids(path: Path) -> tuple[dict[str, Any], tuple[Any, ...]]:

@@ -2,9 +2,11 @@
 
 The measured surface is where the fused signed distance changes its sign. Where nothing was
 measured, decoded logits stand for a distance. From the edge of what was measured its distance is
-carried on, and fades out over a voxel and a half, so that both surfaces meet without a step.
+carried on, and fades out over six fine voxels, so that both surfaces meet without a step; much
+sooner where it would go on as a fin into what the decoded shape leaves free.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,10 +18,16 @@ from skimage.measure import label, marching_cubes
 
 from jaxshape.geometry import evidence
 from jaxshape.geometry.distance import DistanceField, mean_distance
-from jaxshape.geometry.grid import RESOLUTION, GridFrame
+from jaxshape.geometry.grid import GridFrame
 
-REACH = 1.5
-"""Voxels over which measured distances fade out beyond the edge of what was measured."""
+REACH, FIN = 6.0, 1.6
+"""Fine voxels over which measured distances fade out beyond the edge of what was measured; and the
+same where they are solid and the decoded shape is free."""
+
+ROUNDS = 10
+"""Rounds of Taubin's filter, which take off the grain that the noise of few frames leaves. On CAD
+seats the measured surface gets more exact by it; averaging the distances themselves makes it less
+so, for it moves the sides of thin parts."""
 
 NATS = 0.25
 """Logits at the decoded surface: above 0, for occupied voxels reach beyond what they hold."""
@@ -30,11 +38,12 @@ NATS_PER_VOXEL = 6.0
 DEEP = 1.5
 """Fine voxels behind a surface down to which its distances are taken as they are."""
 
-FAR, NEAR = 3.0, 1.5
-"""Fine voxels at which distances end, and within which a measured surface is nearby."""
+FAR, NEAR = 3.0, 0.5
+"""Fine voxels at which distances end, and within which a vertex lies on the measured surface."""
 
-LITTLE = 0.03
-"""Weight at which a measured distance and the smooth surface around it count the same."""
+LITTLE, LESS, AROUND = 0.03, 0.25, 7
+"""Weight at which a measured distance and the smooth surface around it count the same, and as a
+share of the greatest weight among so many fine voxels: edges are ragged where few frames agree."""
 
 CRUMB = 0.01
 """Share of the largest piece's area below which a loose piece is dropped wherever it lies."""
@@ -63,8 +72,8 @@ def fuse_surface(
     """The measured surface, completed by the decoded shape where nothing was measured.
 
     Args:
-        field: Of one object.
-        logits: Its decoded shape, 32 voxels along each side.
+        field: Of one object, on a grid whose side is a multiple of that of the logits.
+        logits: Its decoded shape.
         frame: Of the decoded grid, in the object frame.
 
     Returns:
@@ -74,8 +83,8 @@ def fuse_surface(
         ValueError: Where neither a surface was measured nor a shape decoded.
     """
     fine = field.weight.shape[-1]
-    scale = RESOLUTION / fine * np.asarray(frame.voxel_size, np.float64)
-    distance, measured = combine(field, np.asarray(logits), float(scale.max()))
+    scale = logits.shape[-1] / fine * np.asarray(frame.voxel_size, np.float64)
+    distance, seen = combine(field, np.asarray(logits), float(scale.max()))
     if not (distance < 0).any():
         raise ValueError(
             "There is no surface: nothing was measured inside the box and no logit is above "
@@ -84,19 +93,21 @@ def fuse_surface(
     padded = np.pad(distance, 1, constant_values=max(distance.max(), 1e-3))  # closed at the border
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent")
     vertices -= 0.5  # of the padded grid, whose first centre is at -0.5
-    at = np.clip(np.rint(vertices - 0.5), 0, fine - 1).astype(int)
+    away = ndimage.map_coordinates(seen, (vertices - 0.5).T, order=1, mode="nearest")
     mesh = trimesh.Trimesh(
         np.asarray(frame.origin, np.float64) + vertices * scale, faces, process=False
     )
     if mesh.volume < 0:
         mesh.invert()
-    return _without_loose_pieces(mesh, measured[tuple(at.T)], float(frame.voxel_size[1]))
+    trimesh.smoothing.filter_taubin(mesh, lamb=0.5, nu=0.525, iterations=ROUNDS)
+    measured = _settled(mesh, np.abs(away) < NEAR)
+    return _without_loose_pieces(mesh, measured, float(frame.voxel_size[1]))
 
 
 def combine(
     field: DistanceField, logits: Float[np.ndarray, "x y z"], voxel: float
-) -> tuple[Float[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
-    """Signed distances of the whole shape, and where a surface was measured.
+) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z"]]:
+    """Signed distances of the whole shape, and those that were measured.
 
     Args:
         field: Of one object.
@@ -104,28 +115,39 @@ def combine(
         voxel: Metres that count as 1 in the distances: the side of a fine voxel.
 
     Returns:
-        Distances at the centres of fine voxels, and True next to the measured surface.
+        Distances at the centres of fine voxels, and those measured, far where none were.
     """
-    measured, trusted, free, seen_free = jax.device_get(_measured(field))
+    resolution = len(logits)
+    measured, trusted, free, seen_free = jax.device_get(_measured(field, resolution))
     measured = measured / voxel
-    trusted = trusted & (measured > -DEEP)
-    decoded = _decoded(logits, seen_free, len(measured) // RESOLUTION)
+    scale = len(measured) // resolution
+    trusted = _within_margin(trusted & (measured > -DEEP), 3 * scale // 4)
+    decoded = _decoded(logits, seen_free, scale)
     if not trusted.any():
-        return decoded, trusted
+        return decoded, np.full_like(decoded, FAR)
     distance = _carried_on(measured, trusted, decoded)
     # Free space is smoothed as a whole, so that single rays leave neither holes nor spikes.
     passed = ndimage.gaussian_filter((free & ~trusted).astype(np.float32), 1.0)
     distance = np.maximum(ndimage.gaussian_filter(distance, 1.0), FAR * (2 * passed - 1))
     weight = np.where(trusted, np.asarray(field.weight), 0)
-    certainty = weight**2 / (weight**2 + LITTLE**2)
+    little = np.maximum(LITTLE, LESS * ndimage.maximum_filter(weight, AROUND))
+    certainty = weight**2 / (weight**2 + little**2)
     distance = certainty * measured + (1 - certainty) * distance
-    return _filled(distance, free), trusted & (np.abs(measured) < NEAR)
+    return _filled(distance, free), np.where(trusted, measured, FAR).clip(-FAR, FAR)
 
 
-@jax.jit
-def _measured(field: DistanceField) -> tuple[Array, Array, Array, Array]:
-    free = evidence.evidence(field).free
+@partial(jax.jit, static_argnums=1)
+def _measured(field: DistanceField, resolution: int) -> tuple[Array, Array, Array, Array]:
+    free = evidence.evidence(field, resolution).free
     return mean_distance(field), evidence.is_trusted(field), field.free > 0.5, free
+
+
+def _within_margin(trusted: Bool[np.ndarray, "X Y Z"], width: int) -> Bool[np.ndarray, "X Y Z"]:
+    """Nothing is trusted in the margin that the box leaves free, where only the floor is seen."""
+    inner = slice(width, len(trusted) - width)
+    kept = np.zeros_like(trusted)
+    kept[inner, inner, inner] = trusted[inner, inner, inner]
+    return kept
 
 
 def _decoded(
@@ -147,8 +169,10 @@ def _carried_on(
         ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     )
     away = np.sqrt(((nearest - np.indices(trusted.shape, np.int32)) ** 2).sum(axis=0))
-    share = np.clip(1 - away / (REACH * len(trusted) / RESOLUTION), 0, 1)
-    return share * measured[tuple(nearest)].clip(-FAR, FAR) + (1 - share) * decoded
+    carried = measured[tuple(nearest)].clip(-FAR, FAR)
+    reach = np.where((carried < 0) & (decoded > 0), FIN, REACH)
+    share = np.clip(1 - away / reach, 0, 1)
+    return share * carried + (1 - share) * decoded
 
 
 def _upsample(coarse: Float[np.ndarray, "x y z"], scale: int) -> Float[np.ndarray, "X Y Z"]:
@@ -172,6 +196,18 @@ def _filled(
     seen[labels[0, 0, 0]] = True
     cavity = (labels > 0) & ~seen[labels]
     return np.where(cavity[1:-1, 1:-1, 1:-1], -1.0, distance)
+
+
+def _settled(
+    mesh: trimesh.Trimesh, measured: Bool[np.ndarray, " n"], rounds: int = 4
+) -> Bool[np.ndarray, " n"]:
+    """The flags of most of each vertex and its neighbours: no speckles across a border."""
+    one, other = mesh.edges.T
+    count = np.bincount(one, minlength=len(measured)) + 1
+    for _ in range(rounds):
+        votes = measured + np.bincount(one, weights=measured[other], minlength=len(measured))
+        measured = 2 * votes > count
+    return measured
 
 
 def _without_loose_pieces(

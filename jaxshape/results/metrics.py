@@ -2,7 +2,9 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import KDTree
 
@@ -142,6 +144,42 @@ def shape_scores(
         float(iou(predicted, truth)),
         chamfer_l1(points, true_points, diagonal),
         f_score(points, true_points, F_SCORE_THRESHOLD),
+    )
+
+
+class OccludedScores(NamedTuple):
+    """Agreement of a shape with the true one where nothing was measured; leading axes are batch
+    axes.
+
+    Attributes:
+        iou: Intersection over union of the voxels that are occluded, from 0 to 1. Where none of
+            them holds a piece of the true surface, 1 if none is filled and 0 otherwise.
+        cross_entropy: Mean over the occluded voxels, in nats for each of them; 0 where there are
+            none.
+    """
+
+    iou: Float[Array, "..."]
+    cross_entropy: Float[Array, "..."]
+
+
+def occluded_scores(
+    logits: Float[Array | np.ndarray, "*batch x y z"],
+    occluded: Float[Array | np.ndarray, "*batch x y z"] | Bool[Array | np.ndarray, "*batch x y z"],
+    truth: Bool[Array | np.ndarray, "*batch x y z"],
+) -> OccludedScores:
+    """Score what fills the occluded voxels, those that are more likely unknown than not.
+
+    Args:
+        logits: Logits of the shape that fills them `[*batch x y z]`.
+        occluded: M `[*batch x y z]`, binary or soft: voxels above 1/2 count.
+        truth: True surface voxels `[*batch x y z]`.
+    """
+    hidden, axes = jnp.asarray(occluded) > 0.5, (-3, -2, -1)
+    loss = optax.sigmoid_binary_cross_entropy(jnp.asarray(logits), jnp.asarray(truth, jnp.float32))
+    total = jnp.sum(loss, axis=axes, where=hidden)
+    return OccludedScores(
+        iou((logits > 0) & hidden, truth & hidden),
+        total / jnp.maximum(jnp.sum(hidden, axis=axes), 1),
     )
 
 

@@ -1,17 +1,22 @@
 """The files of one reconstruction: mesh, grids, trace and figures. [host]"""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+import trimesh
+from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxshape.files import atomic_path, write_json
+from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.geometry.overlap import iou
+from jaxshape.geometry.pixels import Sensor
+from jaxshape.results.coloring import ColorView, color_vertices
+from jaxshape.results.fused_surface import fuse_surface
 from jaxshape.results.surface import surface, write_mesh
 from jaxshape.results.traces import write_trace
 from jaxshape.search.reconstruction import Reconstruction
@@ -19,6 +24,10 @@ from jaxshape.search.refiner import StopReason
 
 SMOOTHING = 20
 """Rounds of Taubin's filter that take the staircase off a boolean grid."""
+
+
+COLOR_REACH = 2.0
+"""Voxels over which measured vertices take over a colour from nearby where no frame shows them."""
 
 
 class Observation(NamedTuple):
@@ -31,6 +40,10 @@ class Observation(NamedTuple):
         frame: Voxel frame of the grid, in the object frame.
         T_world_object: Pose of the object `[4 4]`.
         truth: Complete surface of the object `[x y z]`; None where it is not known.
+        field: Fused signed distances, whose surface becomes the mesh where something was measured;
+            None makes the mesh from the composed grid.
+        views: Frames that give the mesh its colours, gone through once; none leave it without.
+        sensor: How the noise of depth grows.
     """
 
     depth: Sequence[Float[np.ndarray, "_ _"]]
@@ -39,6 +52,9 @@ class Observation(NamedTuple):
     frame: GridFrame
     T_world_object: Float[np.ndarray, "4 4"]
     truth: Bool[np.ndarray, "x y z"] | None
+    field: DistanceField | None = None
+    views: Iterable[ColorView] = ()
+    sensor: Sensor = Sensor()
 
 
 def write_result(
@@ -57,10 +73,13 @@ def write_result(
 
     Returns:
         The content of `result.json`: `figures`, the objective before and after in nats per voxel,
-        what the search took and why it stopped, and the IoUs where the truth is known.
+        what the search took and why it stopped, the share of the mesh's area that was measured and
+        the number of loose pieces that were left out, whether what is hidden was filled from its
+        mirror image and the share of the measured halves that agrees, and the IoUs where the truth
+        is known.
 
     Raises:
-        ValueError: Where the composed shape is empty; nothing is written.
+        ValueError: Where the shape is empty; nothing is written.
     """
     folder = Path(folder)
     result = write_shape(folder, observation, reconstruction, figures)
@@ -76,24 +95,73 @@ def write_shape(
 ) -> dict[str, Any]:
     """Write `mesh.glb`, `mesh.ply`, `grid.npz` and `trace.npz` of ONE object; returns its figures.
 
-    The mesh is the composed shape in the world frame, in metres. The trace has a row for each
-    iteration of the search; there is none of the encoder alone.
+    `mesh.ply` lies in the world, `mesh.glb` in the object frame: +y is up in its standard. Both are
+    in metres. The trace has a row for each iteration of the search; there is none of the encoder
+    alone.
     """
     one = only(reconstruction)
-    mesh = surface(
-        one.composed,
-        observation.frame,
-        smoothing=SMOOTHING,
-        T_world_object=observation.T_world_object,
-    )
-    write_mesh(mesh, folder / "mesh.glb")
-    write_mesh(mesh, folder / "mesh.ply")
+    found = shape_mesh(observation, one.composed, one.fill_logits)
+    told = {"measured": found.measured, "color": found.color}
+    write_mesh(found.mesh, folder / "mesh.glb", **told)
+    world = found.mesh.copy().apply_transform(observation.T_world_object)
+    write_mesh(world, folder / "mesh.ply", **told)
     _write_grids(folder / "grid.npz", observation, one)
     if one.trace is None:
         (folder / "trace.npz").unlink(missing_ok=True)  # of an earlier search
     else:
         write_trace(folder / "trace.npz", jax.tree.map(lambda x: x[: one.iterations], one.trace))
-    return {**figures, **_searched(one), **_measured(observation, one)}
+    return {**figures, **_searched(one), **_of_mesh(found), **_measured(observation, one)}
+
+
+class ShapeMesh(NamedTuple):
+    """The mesh of a result.
+
+    Attributes:
+        mesh: In the object frame, in metres.
+        measured: True for vertices on the measured surface, False for predicted ones; None for the
+            mesh of a composed grid.
+        color: Colours of the vertices; None where no frame has colours.
+        dropped: Loose pieces that were left out.
+    """
+
+    mesh: trimesh.Trimesh
+    measured: Bool[np.ndarray, " n"] | None
+    color: UInt8[np.ndarray, "n 3"] | None
+    dropped: int
+
+
+def shape_mesh(
+    observation: Observation,
+    composed: Bool[np.ndarray, "x y z"],
+    logits: Float[np.ndarray, "x y z"],
+) -> ShapeMesh:
+    """The mesh of what was measured and, elsewhere, of the decoded shape.
+
+    Args:
+        observation: Measurement of the object.
+        composed: The composed grid, which makes the mesh where there are no signed distances.
+        logits: Logits of the shape that fills what was not measured.
+
+    Raises:
+        ValueError: The shape is empty.
+    """
+    if observation.field is None:
+        mesh = surface(composed, observation.frame, smoothing=SMOOTHING)
+        return ShapeMesh(mesh, None, None, 0)
+    mesh, measured, dropped = fuse_surface(observation.field, logits, observation.frame)
+    reach = COLOR_REACH * float(np.max(observation.frame.voxel_size))
+    color = color_vertices(
+        mesh, measured, observation.views, reach=reach, sensor=observation.sensor
+    )
+    return ShapeMesh(mesh, measured, color, dropped)
+
+
+def _of_mesh(found: ShapeMesh) -> dict[str, Any]:
+    if found.measured is None:
+        return {}
+    area = found.mesh.area_faces
+    share = found.measured[found.mesh.faces].mean(axis=1) @ area / area.sum()
+    return {"mesh_measured": round(float(share), 4), "mesh_pieces_dropped": found.dropped}
 
 
 def only(reconstruction: Reconstruction) -> Any:
@@ -118,6 +186,9 @@ def _measured(observation: Observation, one: Any) -> dict[str, Any]:
         "voxels_measured": int(observation.occupied.sum()),
         "voxels_occluded": int(observation.occluded.sum()),
     }
+    if one.symmetric is not None:
+        measured["symmetric"] = bool(one.symmetric)
+        measured["symmetry_agreement"] = round(float(one.agreement), 4)
     if observation.truth is not None:
         measured |= {
             "iou_encoder": float(iou(one.completed_first, observation.truth)),

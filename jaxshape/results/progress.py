@@ -4,7 +4,7 @@
     keyframes.json   the camera, the keyframes and what became of every frame
     trajectory.txt   T_world_camera of the frames: TUM's format
     trajectory.log   the same, Open3D's
-    mesh.glb, mesh.ply, grid.npz, trace.npz, result.json: see `output`
+    mesh.ply, mesh.glb, grid.npz, trace.npz, result.json: see `output`
     state.npz        until the run ends: see `checkpoint`
 
 Every file is replaced at once, when the new one is whole, so that `jaxshape view` can watch.
@@ -19,10 +19,12 @@ from PIL import Image
 
 from jaxshape.data.sequences import Sequence, Trajectory, write_trajectory
 from jaxshape.files import atomic_path, write_json
-from jaxshape.geometry import fusion
+from jaxshape.geometry.distance import DistanceField
+from jaxshape.geometry.grids import binary
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
-from jaxshape.mapping.map.state import MapState
+from jaxshape.mapping.map.state import MapState, grids_of
 from jaxshape.mapping.tracking.keyframes import Keyframe
+from jaxshape.results.coloring import ColorView
 from jaxshape.results.output import Observation, write_shape
 
 FRAMES_TO_SHOW = 6
@@ -33,7 +35,6 @@ def write_progress(
     sequence: Sequence,
     progress: Progress,
     figures: dict[str, Any],
-    min_hits: int,
     *,
     running: bool,
 ) -> dict[str, Any]:
@@ -44,7 +45,6 @@ def write_progress(
         sequence: The recording.
         progress: Progress of the run.
         figures: Further entries of `result.json`.
-        min_hits: Depth points that make a voxel occupied.
         running: Whether the run goes on.
 
     Returns:
@@ -52,7 +52,9 @@ def write_progress(
     """
     _write_pictures(folder / "keyframes", sequence, progress)
     _write_trajectory(folder, sequence, progress)
-    observation = observation_of(progress.state, min_hits)
+    observation = observation_of(progress.state)
+    if observation.field is not None:
+        observation = observation._replace(views=color_views(sequence, progress))
     start = progress.start
     result = {**figures, **counts(progress), "notes": start.notes, "warnings": start.warnings}
     result["box"] = {
@@ -68,18 +70,33 @@ def write_progress(
     return result
 
 
-def observation_of(state: MapState, min_hits: int) -> Observation:
+def observation_of(state: MapState) -> Observation:
     """Measurement of the object by the keyframes of a map."""
+    grids = binary(grids_of(state))
     every = max(1, len(state.keyframes) // FRAMES_TO_SHOW)
     shown = state.keyframes[::every][:FRAMES_TO_SHOW]
     return Observation(
         depth=[_crop(np.asarray(one.depth), np.asarray(one.segmented)) for one in shown],
-        occupied=np.asarray(fusion.occupied(state.measurement, min_hits)),
-        occluded=np.asarray(fusion.occluded(state.measurement, min_hits)),
+        occupied=np.asarray(grids.occupied),
+        occluded=np.asarray(grids.occluded),
         frame=state.place.frame,
         T_world_object=state.place.box.T_world_object,
         truth=None,
+        field=state.measurement if isinstance(state.measurement, DistanceField) else None,
+        sensor=state.fusing.sensor,
     )
+
+
+def color_views(sequence: Sequence, progress: Progress) -> Iterator[ColorView]:
+    """The keyframes that have colours, at their present poses, read one after the other."""
+    T_object_world = np.linalg.inv(progress.state.place.box.T_world_object)
+    K = sequence.intrinsics
+    intrinsics = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    for log, keyframe in _fused(progress):
+        frame = sequence[log.index]
+        if frame.color is not None:
+            T_world_camera = np.asarray(keyframe.T_world_camera.as_matrix(), np.float64)
+            yield ColorView(frame.color, frame.depth, intrinsics, T_object_world @ T_world_camera)
 
 
 def counts(progress: Progress) -> dict[str, int]:

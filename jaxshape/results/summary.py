@@ -38,6 +38,11 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
             "of the refined one; lower is better"
         )
         yield Figure("Objective", f"{before} → {after}", meaning)
+    if "mesh_measured" in result:
+        value = number(result["mesh_measured"], 0, times=100.0, unit=" %")
+        left_out = number(result.get("mesh_pieces_dropped"))
+        meaning = f"of the mesh’s area; the rest is predicted. Loose pieces left out: {left_out}"
+        yield Figure("Measured", value, meaning)
     if "iou_composed" in result:
         before, after = (number(result.get(f"iou_{n}"), 3) for n in ("encoder", "refined"))
         meaning = (
@@ -68,6 +73,7 @@ def _minimised(result: dict[str, Any]) -> str:
         "": "Eq. 7 or a variant of it",
         "paper": "Eq. 7 as printed",
         "balanced": "Eq. 7, where measured free space counts a third",
+        "soft": "Eq. 7, where each voxel counts by how sure its measurement is",
     }
     return words.get(name, f"the objective {name}")
 

@@ -2,11 +2,13 @@
 
 import os
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt8
 from skimage.measure import marching_cubes
+from trimesh.visual import ColorVisuals
 
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grid import GridFrame
@@ -82,12 +84,22 @@ def voxel_surface(
     return mesh
 
 
-def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
+def write_mesh(
+    mesh: trimesh.Trimesh,
+    path: str | os.PathLike[str],
+    *,
+    measured: Bool[np.ndarray, " n"] | None = None,
+    color: UInt8[np.ndarray, "n 3"] | None = None,
+) -> None:
     """Write a mesh as PLY, GLB or OBJ; an earlier file is replaced only by a complete one. [host]
 
     Args:
         mesh: The mesh to write.
         path: The file to write; its suffix names the format, `.ply`, `.glb` or `.obj`.
+        measured: True for vertices on a measured surface: `measured` in PLY, `_MEASURED` in GLB, 1
+            or 0 for each vertex. None for no such flags; OBJ has none.
+        color: Colours of the vertices, sRGB; None for none. GLB holds them as linear light, as its
+            standard asks.
 
     Raises:
         ValueError: The suffix is another one.
@@ -98,5 +110,77 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
             f"A mesh is written as one of {', '.join(MESH_SUFFIXES)}, but {str(path)!r} ends in "
             f"{suffix or 'no suffix'!r}."
         )
+    copy = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     with atomic_path(path) as temporary:
-        mesh.export(temporary)
+        if suffix == ".glb":
+            _export_glb(copy, temporary, measured, color)
+            return
+        if color is not None:
+            copy.visual = ColorVisuals(copy, vertex_colors=color)
+        if measured is not None and suffix == ".ply":
+            copy.vertex_attributes["measured"] = measured.astype(np.uint8)
+        copy.export(temporary)
+
+
+def _export_glb(
+    mesh: trimesh.Trimesh,
+    path: Path,
+    measured: Bool[np.ndarray, " n"] | None,
+    color: UInt8[np.ndarray, "n 3"] | None,
+) -> None:
+    """Write a GLB with normals, so that viewers shade it smoothly, and a dull material."""
+    if measured is not None:
+        mesh.vertex_attributes["_MEASURED"] = measured.astype(np.float32)
+    if color is not None:
+        linear = _linear_light(color)
+        mesh.vertex_attributes["_COLOR_0"] = np.insert(linear, 3, 1, axis=1).astype(np.float32)
+
+    def finish(tree: dict[str, Any]) -> None:
+        for part in tree["meshes"][0]["primitives"]:
+            part["material"] = 0
+            if color is not None:
+                part["attributes"]["COLOR_0"] = part["attributes"].pop("_COLOR_0")
+        dull = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+        tree["materials"] = [{"pbrMetallicRoughness": dull, "doubleSided": True}]
+
+    mesh.export(path, include_normals=True, tree_postprocessor=finish)
+
+
+def _linear_light(color: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """sRGB as linear light, 0 to 1 (IEC 61966-2-1)."""
+    share = color / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+class MeshFile(NamedTuple):
+    """A mesh as it was written.
+
+    Attributes:
+        mesh: Its vertices and faces.
+        measured: True for vertices on a measured surface; None where the file does not tell.
+        color: Colours of the vertices, sRGB; None where there are none.
+    """
+
+    mesh: trimesh.Trimesh
+    measured: Bool[np.ndarray, " n"] | None
+    color: UInt8[np.ndarray, "n 3"] | None
+
+
+def read_ply(path: str | os.PathLike[str]) -> MeshFile:
+    """Read a PLY file that `write_mesh` wrote.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ValueError: It has no faces, or vertices that are not finite.
+    """
+    mesh = trimesh.load_mesh(path, process=False)  # processing would change the vertices
+    if not np.isfinite(mesh.vertices).all() or len(mesh.faces) == 0:
+        raise ValueError("it has no faces, or vertices that are not finite")
+    vertex = mesh.metadata["_ply_raw"]["vertex"]
+    measured = vertex["data"]["measured"] > 0 if "measured" in vertex["properties"] else None
+    visual: Any = mesh.visual
+    color = visual.vertex_colors[:, :3] if visual.kind == "vertex" else None
+    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    return MeshFile(plain, measured, None if color is None else np.asarray(color))

@@ -11,6 +11,15 @@ ObjectiveName = Literal["balanced", "paper", "soft"]
 Space = Literal["whitened", "raw"]
 
 
+def objective_for(fusion: str) -> ObjectiveName:
+    """The objective that suits the grids of a way to fuse frames.
+
+    Args:
+        fusion: "distance", whose F and M are soft, or "points", whose F and M are binary.
+    """
+    return "soft" if fusion == "distance" else "balanced"
+
+
 def is_array(value: Any) -> bool:
     """Whether a setting is a JAX array, which may be traced, so that its value is not known."""
     return hasattr(value, "aval")
@@ -23,7 +32,8 @@ class RefineConfig:
     Attributes:
         objective: The residual that is minimised: `paper` is Eq. 7 as printed; in `balanced`
             measured free space counts a third; in `soft` each voxel counts by how sure its
-            measurement is.
+            measurement is. None for `soft` where F and M are soft, as signed distances give them,
+            and `balanced` where they are binary.
         iterations: Steps of the search at most, 1 or more (paper: 350).
         population: Candidates per iteration of a population search, 3 or more (pycma's default for
             100 dimensions is 17).
@@ -42,13 +52,15 @@ class RefineConfig:
             such target.
         precision: Precision of the decoder's matrix products during the search, `float32` or
             `bfloat16`.
+        symmetry: Fill what is hidden on one side of an object with what its mirror image shows,
+            where the measured halves agree (not in the paper). The search itself is the same.
 
     Raises:
         ValueError: A setting is outside its range. Arrays of JAX, which may be traced, are not
             checked.
     """
 
-    objective: ObjectiveName = "balanced"
+    objective: ObjectiveName | None = None
     iterations: int = 350
     population: int = 17
     sigma0: float = 0.1
@@ -59,11 +71,14 @@ class RefineConfig:
     tolerance: float = 1e-6
     target: float | None = None
     precision: Precision = "float32"
+    symmetry: bool = True
 
     def __post_init__(self) -> None:
-        one_of("objective", self.objective, get_args(ObjectiveName))
+        if self.objective is not None:
+            one_of("objective", self.objective, get_args(ObjectiveName))
         one_of("space", self.space, get_args(Space))
         one_of("precision", self.precision, get_args(Precision))
+        one_of("symmetry", self.symmetry, (True, False))
         whole("iterations", self.iterations, 1)
         whole("population", self.population, 3)
         for name in ("sigma0", "step_size", "bound"):

@@ -11,12 +11,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.shapes import ShapePrior, decode, encode
-from jaxshape.search.config import RefineConfig
+from jaxshape.search.composition import complete
+from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty
 from jaxshape.search.refiner import Refiner, Trace
 from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual
-from jaxshape.search.run import Refined, refine
+from jaxshape.search.run import refine
 from jaxshape.search.space import LatentSpace, raw, whitened
 
 
@@ -29,8 +30,12 @@ class Reconstruction(NamedTuple):
         completed_first: The decoded first code, G(lambda_0) > 0.5 `[object x y z]`.
         logits: Logits of the refined shape `[object x y z]`.
         completed: The refined shape, G(lambda) > 0.5 `[object x y z]`.
-        composed: What was measured where something was, the refined shape elsewhere
-            `[object x y z]`.
+        composed: What was measured where something was, the filling elsewhere `[object x y z]`.
+        fill_logits: Logits of the filling `[object x y z]`: of the refined shape, averaged with its
+            mirror image and with what that showed where the object is symmetric.
+        symmetric: Whether the filling is mirrored `[object]`; None without `config.symmetry`.
+        agreement: Share of the surface measured on both sides that agrees, 0 to 1 `[object]`; None
+            without `config.symmetry`.
         first_objective: Residual of the first code `[object]`, in nats per voxel.
         objective: Residual of the refined code `[object]`, in nats per voxel.
         trace: Trace of the search `[object iteration ...]`; None without a search.
@@ -45,28 +50,15 @@ class Reconstruction(NamedTuple):
     logits: Float[Array, "object x y z"]
     completed: Bool[Array, "object x y z"]
     composed: Bool[Array, "object x y z"]
+    fill_logits: Float[Array, "object x y z"]
+    symmetric: Bool[Array, " object"] | None
+    agreement: Float[Array, " object"] | None
     first_objective: Float[Array, " object"]
     objective: Float[Array, " object"]
     trace: Trace | None
     path: Float[Array, "object iteration d"] | None
     iterations: Int[Array, " object"] | None
     stop: Int[Array, " object"] | None
-
-
-def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*batch x y z"]:
-    """Keep what was observed as measured; fill what was occluded with the completed shape.
-
-    Args:
-        occupied: F `[*batch x y z]`, binary or soft.
-        occluded: M `[*batch x y z]`, binary or soft.
-        completed: The decoded shape `[*batch x y z]`: True where occupied, or its probability.
-
-    Returns:
-        The composed shape `[*batch x y z]`: True where (1 - M) F + M p is above 1/2. For binary
-        grids that is F where something was measured, and the completed shape elsewhere.
-    """
-    F, M, p = (jnp.asarray(x).astype(jnp.float32) for x in (occupied, occluded, completed))
-    return (1 - M) * F + M * p > 0.5
 
 
 def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner | None:
@@ -92,6 +84,12 @@ def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner
 def search_space(prior: ShapePrior, config: RefineConfig) -> LatentSpace:
     """The coordinates in which codes are searched, which `config.space` names."""
     return {"whitened": whitened, "raw": raw}[config.space](prior, config.bound)
+
+
+def residual_for(grids: Grids, config: RefineConfig) -> Residual:
+    """The residual that the settings name, or else the one that suits F and M."""
+    is_soft = jnp.issubdtype(jnp.result_type(grids.occupied), jnp.floating)
+    return RESIDUALS[config.objective or objective_for("distance" if is_soft else "points")]
 
 
 def code_penalty(prior: ShapePrior, weight: float) -> Penalty | None:
@@ -146,7 +144,7 @@ def reconstruct(
     """
     grids = Grids(occupied, occluded, data)
     require_batch(grids)
-    residual = RESIDUALS[config.objective] if residual is None else residual
+    residual = residual_for(grids, config) if residual is None else residual
     first_code = encode(prior, grids)
     first_logits = decode(prior, first_code, grids)
     targets = jax.vmap(residual.target)(grids, first_logits)
@@ -178,21 +176,17 @@ def reconstruct(
             precision=config.precision,
         )
         code, logits, objective = found.code, found.logits, score(found.logits, targets)
-    return _reconstruction(grids, first_code, first_logits, first_objective, code, logits,
-                           objective, found)  # fmt: skip
-
-
-def _reconstruction(
-    grids, first_code, first_logits, first_objective, code, logits, objective, found: Refined | None
-) -> Reconstruction:
-    completed = logits > 0
+    filled = complete(grids, logits, symmetry=config.symmetry)
     return Reconstruction(
         first_code=first_code,
         code=code,
         completed_first=first_logits > 0,
         logits=logits,
-        completed=completed,
-        composed=compose(grids.occupied, grids.occluded, jax.nn.sigmoid(logits)),
+        completed=logits > 0,
+        composed=filled.composed,
+        fill_logits=filled.logits,
+        symmetric=filled.symmetric,
+        agreement=filled.agreement,
         first_objective=first_objective,
         objective=objective,
         trace=found and found.trace,

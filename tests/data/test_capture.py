@@ -5,9 +5,20 @@ import pytest
 import trimesh
 from scipy.ndimage import binary_dilation
 
-from jaxshape.data.capture import camera_distance, capture, discretize, measure_frames
-from jaxshape.data.virtual_cameras import VirtualCamera
+from jaxshape.data.capture import (
+    camera_distance,
+    capture,
+    discretize,
+    fuse_frames,
+    fused_frames,
+    fused_grids,
+    measure_frames,
+    sensor_of,
+)
+from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
 from jaxshape.geometry import camera, fusion, grid
+from jaxshape.geometry.evidence import soft_grids
+from jaxshape.geometry.fusing import Distances, Points
 
 AZIMUTHS = jnp.repeat(jnp.arange(0.0, 360.0, 60.0), 2)
 ELEVATIONS = jnp.tile(jnp.array([35.0, -35.0]), 6)
@@ -95,3 +106,27 @@ def test_discretising_points_agrees_with_a_histogram():
 def test_the_camera_stands_in_proportion_to_the_objects_diagonal():
     box = trimesh.creation.box((0.3, 0.4, 1.2))
     np.testing.assert_allclose(camera_distance(box), 1.5 * 1.3)
+
+
+def test_frames_fused_in_one_go_and_one_after_the_other_are_the_same(ellipsoid):
+    """The field of so many frames, its grids, and the grids after each number of frames."""
+    sensor = sensor_of(CAMERAS["kinect"])
+    poses = jax.tree.map(lambda x: x[:3], ellipsoid.T_object_camera)
+    few = ellipsoid._replace(depth=ellipsoid.depth[:3], T_object_camera=poses)
+    state, grids = fused_frames(few, Distances(), sensor)
+    fields = fuse_frames(few, (1, 3), sensor)
+    cumulative = fused_grids(few, Distances(), (1, 3), sensor)
+    np.testing.assert_allclose(state.weight, fields.weight[1], atol=1e-5)
+    expected = soft_grids(fields)
+    np.testing.assert_allclose(cumulative.occupied, expected.occupied, atol=1e-4)
+    np.testing.assert_allclose(cumulative.occluded, expected.occluded, atol=1e-4)
+    np.testing.assert_allclose(grids.occupied, cumulative.occupied[1], atol=1e-4)
+
+
+def test_points_of_more_and_more_frames_are_those_of_each_number(ellipsoid):
+    grids = fused_grids(ellipsoid, Points(), (2, 5, 12))
+    merged = fusion.merge_cumulative(measure_frames(ellipsoid))
+    for i, k in enumerate((2, 5, 12)):
+        one = jax.tree.map(lambda x, k=k: x[k - 1], merged)
+        np.testing.assert_array_equal(grids.occupied[i], fusion.occupied(one))
+        np.testing.assert_array_equal(grids.occluded[i], fusion.occluded(one))

@@ -10,6 +10,7 @@ from jaxshape.data.meshes import (
     Model,
     Skipped,
     canonical,
+    in_metres,
     list_meshes,
     load,
     lying_on_its_side,
@@ -360,3 +361,12 @@ def test_a_chair_with_a_wrong_up_axis_is_noticed(up, front):
 @pytest.mark.parametrize("mesh", [trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere()])
 def test_shapes_without_a_clear_up_are_left_alone(mesh):
     assert not lying_on_its_side(mesh)
+
+
+def test_sizes_that_nothing_in_a_room_has_are_not_taken_for_metres():
+    chair = trimesh.creation.box(SIZE)
+    assert in_metres(chair) is chair
+    for scale in (1e-3, 39.4, 1000):
+        other = in_metres(chair.copy().apply_scale(scale))
+        assert other.scale == pytest.approx(1)
+        np.testing.assert_allclose(other.vertices * chair.scale, chair.vertices, atol=1e-9)

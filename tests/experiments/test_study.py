@@ -1,5 +1,6 @@
 """Contestants are compared on the same cases, chair by chair, whatever the batches."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -8,10 +9,11 @@ import numpy as np
 import pytest
 
 from jaxshape.data.chairs import random_chair
-from jaxshape.results.evaluation import EvaluateConfig, evaluate
+from jaxshape.results.evaluation import evaluate
 from jaxshape.results.journal import Journal
 from jaxshape.search.config import RefineConfig
 from study import (
+    SEEN,
     TestSet,
     by_method,
     column,
@@ -23,7 +25,7 @@ from study import (
 )
 
 FRAMES = (1, 2)
-SEARCH = RefineConfig(iterations=2, population=4)
+SEARCH = RefineConfig(iterations=2, population=4, symmetry=False)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +82,7 @@ def test_scores_are_those_of_an_evaluation(journal, test_set, linear_prior):
     from jaxshape.data.dataset import load_object
 
     models = [load_object(one.item) for one in subjects(test_set)]
-    config = EvaluateConfig(FRAMES, ("encoder", "cma"), refine=SEARCH)
+    config = replace(SEEN, frames=FRAMES, methods=("encoder", "cma"), refine=SEARCH)
     for scores in evaluate(linear_prior, models, config):
         for k in ("1", "2"):
             ours, theirs = journal.rows[scores["name"]][k], scores["frames"][k]

@@ -6,7 +6,7 @@ import pytest
 from jaxshape.geometry import distance, evidence
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.evidence import Evidence
-from jaxshape.geometry.grids import binary
+from jaxshape.geometry.grids import Grids, binary
 
 N = 128
 find = jax.jit(evidence.evidence)
@@ -93,3 +93,15 @@ def test_thresholds_split_all_voxels():
     found = Evidence(jnp.linspace(0, 1, 32**3).reshape(32, 32, 32), jnp.zeros((32, 32, 32)))
     F, M, _ = binary(evidence.as_grids(found))
     np.testing.assert_array_equal(F ^ M, True)
+
+
+def test_grids_and_evidence_say_the_same():
+    """There and back, soft and binary; F is not defined where nothing is known."""
+    F, M = jax.random.uniform(jax.random.key(0), (2, 3, 4, 5))
+    again = evidence.as_grids(evidence.from_grids(Grids(F, M)))
+    np.testing.assert_allclose(again.occupied, F, atol=1e-5)
+    np.testing.assert_allclose(again.occluded, M, atol=1e-6)
+    hard = Grids((F > 0.5) & (M < 0.5), M > 0.5)
+    found = evidence.from_grids(hard)
+    np.testing.assert_array_equal(found.surface, hard.occupied)
+    np.testing.assert_array_equal(found.free, ~hard.occupied & ~hard.occluded)

@@ -14,8 +14,9 @@ from jaxshape.data.sequences.frames import FrameFiles
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.mapping.config import MappingConfig
 from jaxshape.mapping.map.recording import FrameLog, Progress
-from jaxshape.mapping.map.state import MapState
+from jaxshape.mapping.map.state import MapState, fusing_of
 from jaxshape.mapping.placement.finding import Start
 from jaxshape.mapping.tracking.keyframes import Keyframe, Place
 from jaxshape.results.output import write_result
@@ -58,7 +59,7 @@ def write_folder(folder):
     """What `reconstruct` leaves, and `demo`, which knows the truth; without the overview."""
     figures = {"object": "a chair", "seconds": 12.34, "search": {"objective": "balanced"}}
     sequence = _recording(folder.parent / "recording")
-    write_progress(folder, sequence, _progress(), figures, 1, running=False)
+    write_progress(folder, sequence, _progress(), figures, running=False)
     write_result(folder, OBSERVATION, RECONSTRUCTION, figures)
 
 
@@ -108,6 +109,7 @@ def _progress():
         MapState,
         keyframes=tuple(keyframes),
         place=only(Place, box=box, frame=FRAME),
+        fusing=fusing_of(MappingConfig(fusion="points", min_hits=1), 32),
         measurement=Measurement(jnp.int32(OCCUPIED), jnp.asarray(~(OCCUPIED | OCCLUDED))),
     )
     start = only(Start, box=box, notes=(), warnings=())

@@ -13,9 +13,15 @@ from jaxshape.report.card import COLUMNS, describe, hardware, rows_of, training_
 PATHS = {"paths": 3, "frames": [1, 4], "cameras": ["paper", "kinect"], "noisy": 0.25}
 DATA = {"config": PATHS, "objects": 50, "used": 48, "source": "mugs/"}
 METRICS = [Report(3, 0.5, 0.1, None, None, 9.0, 20.4), Report(5, 0.25, 0.75, 0.6, 0.4, 9.0, 30.3)]
-SCORES = dict(iou=0.1, iou_composed=0.2, chamfer_l1=0.01234, f_score=0.4, objective=0.5)
+SCORES = dict(
+    iou=0.1, iou_composed=0.2, iou_occluded=0.3, cross_entropy_occluded=0.6, chamfer_l1=0.01234,
+    f_score=0.4, objective=0.5,
+)  # fmt: skip
 MEANS = {"4": {"cma": SCORES, "bounds": {"occluded_empty": 0.6, "occluded_full": 0.7}}}
-EVALUATED = {"config": {"refine": {"iterations": 50}}, "per_mesh": [{}] * 5, "means": MEANS}
+SEEN = {"camera": "kinect", "noise": True, "fusion": "distance"}
+EVALUATED = {
+    "config": SEEN | {"refine": {"iterations": 50}}, "per_mesh": [{}] * 5, "means": MEANS
+}  # fmt: skip
 
 
 def card_of(config=TrainConfig(steps=5, batch=2), start=None):  # noqa: B008 - it is frozen
@@ -42,7 +48,7 @@ def test_a_card_tells_what_was_done():
         "51 s on",
         "0.2500 nats per voxel, IoU 0.750",
         "5 of the same folder",
-        "50 iterations",
+        "camera kinect with noise, fused as signed distances; 50 iterations",
         "48 objects are few",
     ):
         assert said in text, said
@@ -67,12 +73,12 @@ def test_samples_add_up_over_runs(tmp_path, prior):
 def test_the_tables_hold_the_means():
     bounds = MEANS["4"]["bounds"] | {"ceiling": 0.8}
     rows = list(rows_of({"4": MEANS["4"] | {"bounds": bounds}}))
-    assert rows[0] == ["4", "cma", "0.100", "0.200", "0.0123", "0.400", "0.500"]
+    assert rows[0] == ["4", "cma", "0.100", "0.200", "0.300", "0.600", "0.0123", "0.400", "0.500"]
     assert [row[:3] for row in rows[1:]] == [
         ["4", "F", "0.600"], ["4", "F or M", "0.700"], ["4", "ceiling", "0.800"]
     ]  # fmt: skip
     lines = describe("mug", card_of(), EVALUATED).splitlines()
-    assert "| 4 | cma | 0.100 | 0.200 | 0.0123 | 0.400 | 0.500 |" in lines
+    assert "| 4 | cma | 0.100 | 0.200 | 0.300 | 0.600 | 0.0123 | 0.400 | 0.500 |" in lines
     assert {len(row) for row in rows} == {len(COLUMNS)}
 
 

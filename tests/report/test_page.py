@@ -28,8 +28,9 @@ from result_folder import (
 
 from jaxshape.report import illustrations, plots
 from jaxshape.report.page import write_report
+from jaxshape.results.surface import read_ply
 
-FILES = ("mesh.glb", "grid.npz", "trace.npz", "keyframes.json", "result.json")
+FILES = ("mesh.ply", "grid.npz", "trace.npz", "keyframes.json", "result.json")
 
 
 @pytest.fixture
@@ -171,7 +172,7 @@ def test_grids_travel_as_bits(page):
 
 
 def test_the_mesh_is_shown_in_the_object_frame(page, made):
-    mesh = trimesh.load_mesh(made / "mesh.glb")
+    mesh = trimesh.load_mesh(made / "mesh.ply")
     vertices = floats(layers(page)["mesh"]["vertices"]).reshape(-1, 3)
     faces = np.frombuffer(base64.b64decode(layers(page)["mesh"]["faces"]), "<u4")
     back = vertices @ T_WORLD_OBJECT[:3, :3].T + T_WORLD_OBJECT[:3, 3]
@@ -180,6 +181,26 @@ def test_the_mesh_is_shown_in_the_object_frame(page, made):
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     np.testing.assert_allclose(page.scene["center"], (low + high) / 2, atol=1e-5)
     assert page.scene["radius"] == pytest.approx(np.linalg.norm(high - low) / 2, rel=1e-4)
+
+
+def test_the_mesh_can_be_seen_in_colours_and_by_its_source(painted, quick):
+    page = report(painted)
+    paints = layers(page)["mesh"]["paints"]
+    color, source = (
+        np.frombuffer(base64.b64decode(paints[name]), np.uint8).reshape(-1, 3)
+        for name in ("color", "source")
+    )
+    written = read_ply(painted / "mesh.ply")
+    np.testing.assert_array_equal(color, written.color)
+    blue, orange = (0, 0x72, 0xB2), (0xE6, 0x9F, 0)
+    np.testing.assert_array_equal(source, np.where(written.measured[:, None], blue, orange))
+    assert page.all("id").count("paint") == 1
+    options = [value for tag, _, value in page.attributes if tag == "option"]
+    assert options == ["color", "source"]
+
+
+def test_a_mesh_without_colours_offers_none(page):
+    assert layers(page)["mesh"]["paints"] == {} and "paint" not in page.all("id")
 
 
 def test_cameras_stand_where_they_were_and_look_ahead(page):
@@ -269,7 +290,7 @@ def test_no_folder_is_refused(tmp_path):
 @pytest.mark.usefixtures("quick")
 def test_before_the_object_is_found_the_first_camera_tells_what_is_up(folder):
     (folder / "grid.npz").unlink()
-    (folder / "mesh.glb").unlink()
+    (folder / "mesh.ply").unlink()
     path = floats(layers(report(folder))["trajectory"]["lines"]).reshape(-1, 3)
     np.testing.assert_allclose(path[:2], [[0, 0, 0], [0.1, 0, 0]], atol=1e-5)
 
@@ -355,6 +376,29 @@ def test_a_browser_draws_and_turns_the_shape(folder):
         assert blue.mean() > 0.01
         assert heard == [path.as_uri(), *[url for url in heard if url.startswith("data:")]]
         assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_a_browser_paints_the_mesh_as_chosen(painted):
+    path = write_report(painted)
+    with opened_browser() as browser:
+        tab = browser.new_page(viewport={"width": 390, "height": 800})
+        heard = []
+        tab.on("pageerror", lambda error: heard.append(str(error)))
+        tab.goto(path.as_uri())
+        tab.wait_for_selector("#shape.live canvas")
+        canvas = tab.locator("#turnable")
+        canvas.scroll_into_view_if_needed()
+        tab.wait_for_timeout(300)
+
+        def share(color):
+            return (np.abs(shown(canvas) - color).sum(axis=-1) < 120).mean()
+
+        green, blue, orange = (20, 160, 60), (0, 0x72, 0xB2), (0xE6, 0x9F, 0)
+        assert share(green) > 0.03 and share(orange) == 0
+        tab.select_option("#paint", "source")
+        tab.wait_for_timeout(300)
+        assert share(blue) > 0.01 and share(orange) > 0.01 and share(green) < 0.01
+        assert not heard
 
 
 def test_without_webgl_there_is_a_picture(folder):

@@ -20,6 +20,7 @@ from jaxshape.report.panels import (
     write_panels,
 )
 from jaxshape.report.pictures import render_voxels
+from jaxshape.results.output import write_shape
 
 
 def test_depth_panels_share_a_scale_and_show_what_is_unknown():
@@ -82,6 +83,7 @@ def test_the_overview_shows_depth_then_grids_and_the_truth_where_it_is_known(
     truth, occluded = completed if known else None, solid((8, 4, 4), (28, 28, 28))
     seen = observation(occupied, occluded, truth, frame)
     found = reconstruction(seen, occupied, completed, steps=3)
+    write_shape(tmp_path, seen, found, {})
     written = []
     monkeypatch.setattr(panels, "write_panels", lambda path, rows: written.append((path, rows)))
     write_overview(tmp_path, seen, found, {"iou_refined": 1.0} if known else {})

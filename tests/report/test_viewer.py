@@ -60,6 +60,23 @@ def test_the_scene_holds_shape_grids_and_cameras(folder, open_view):
     assert occupied.visible
 
 
+def test_the_mesh_is_painted_as_chosen(painted, open_view):
+    live = open_view(painted)
+    assert live.paint.visible and len(live.paint.options) == 2
+    first = live._drawn["/mesh"][1]
+    live.paint.value = live.paint.options[1]
+    live._scene()
+    second = live._drawn["/mesh"][1]
+    assert second is not first and second.visible
+    before = second
+    live._scene()
+    assert live._drawn["/mesh"][1] is before  # nothing changed
+
+
+def test_a_plain_mesh_has_no_choice_of_colours(folder, open_view):
+    assert not open_view(folder).paint.visible
+
+
 def test_cubes_lie_on_the_voxels(folder, open_view):
     _, truth = open_view(folder)._drawn["/truth"]
     low, high = truth.batched_positions.min(axis=0), truth.batched_positions.max(axis=0)
@@ -88,12 +105,12 @@ def test_a_folder_that_fills_is_shown_as_it_does(made, tmp_path, open_view):
     live = open_view(folder)
     assert not nodes(live)
     shutil.copytree(made / "keyframes", folder / "keyframes")
-    (folder / "mesh.glb").write_bytes(b"half")
+    (folder / "mesh.ply").write_bytes(b"half")
     shutil.copy(made / "keyframes.json", folder)
     assert live.refresh() and len(nodes(live)) == KEYFRAMES + 1
-    assert "mesh.glb cannot be read" in live.figures.content
+    assert "mesh.ply cannot be read" in live.figures.content
     assert live.slider.value == KEYFRAMES - 1  # the newest
-    for name in ("mesh.glb", "grid.npz", "result.json"):
+    for name in ("mesh.ply", "grid.npz", "result.json"):
         shutil.copy(made / name, folder)
     assert live.refresh() and {"/mesh"} | GRIDS <= nodes(live)
     assert "cannot be read" not in live.figures.content

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from jaxshape.data.sequences import SequenceError
+from jaxshape.mapping.config import MappingConfig
 from jaxshape.mapping.map.recording import follow
 from jaxshape.results.checkpoint import STATE, load_state, remove_state, save_state
 
@@ -19,7 +20,7 @@ def last_keyframe(steps):
 
 
 def load(folder, sequence, prior, settings=SETTINGS):
-    return load_state(folder, sequence, prior, settings, isotropic=False)
+    return load_state(folder, sequence, prior, settings, MappingConfig())
 
 
 def assert_identical(ours, theirs):

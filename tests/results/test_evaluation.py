@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
+from jaxshape.data.dataset import hash_seed
 from jaxshape.data.meshes import Model
+from jaxshape.geometry import camera, fusion
+from jaxshape.geometry.grids import Grids, binary
 from jaxshape.geometry.overlap import iou
 from jaxshape.results import evaluation
 from jaxshape.results.evaluation import (
@@ -24,7 +28,10 @@ from jaxshape.results.metrics import bounds
 from jaxshape.search.config import RefineConfig
 
 CONFIG = EvaluateConfig((1, 2), refine=RefineConfig(iterations=2, population=4), seed=3)
-SCORES = {"iou", "iou_composed", "chamfer_l1", "f_score", "objective"}
+AS_IN_THE_PAPER = replace(CONFIG, camera="paper")
+IOUS = {"iou", "iou_composed", "iou_occluded"}
+NATS = {"cross_entropy_occluded", "objective"}
+SCORES = IOUS | NATS | {"chamfer_l1", "f_score"}
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +57,8 @@ def test_each_mesh_has_all_scores_of_all_methods(scores, models):
             assert set(methods["bounds"]) == {"occluded_empty", "occluded_full"}
             for method in CONFIG.methods:
                 assert set(methods[method]) == SCORES
-                assert all(0 <= methods[method][s] <= 1 for s in SCORES - {"objective"})
+                assert all(0 <= methods[method][s] <= 1 for s in SCORES - NATS)
+                assert all(0 < methods[method][s] < 10 for s in NATS)
             assert methods["cma"]["objective"] <= methods["encoder"]["objective"] + 1e-6
             assert methods["gradient"]["objective"] <= methods["encoder"]["objective"] + 1e-6
 
@@ -102,31 +110,65 @@ def test_a_search_finds_the_same_for_a_mesh_alone_and_in_company(linear_prior, s
 
 def test_frames_are_the_first_of_the_orbit(models):
     """More frames leave less occluded, and what one frame measured stays measured."""
-    case = observe(models[0], CONFIG)
-    assert case.occupied.shape == (2, 32, 32, 32)
-    assert np.all(case.occupied[1][case.occupied[0]])
-    assert np.all(case.occluded[0][case.occluded[1]])
-    assert case.occluded[1].sum() < case.occluded[0].sum()
+    case = observe(models[0], AS_IN_THE_PAPER)
+    F, M, _ = case.grids
+    assert F.shape == (2, 32, 32, 32) and F.dtype == bool
+    assert np.all(F[1][F[0]])
+    assert np.all(M[0][M[1]])
+    assert M[1].sum() < M[0].sum()
     np.testing.assert_array_equal(case.surface[0], case.surface[1])
-    swapped = observe(models[0], replace(CONFIG, frames=(2, 1)))
+    swapped = observe(models[0], replace(AS_IN_THE_PAPER, frames=(2, 1)))
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[::-1], y), case, swapped)
-    low, _ = bounds(case.occupied, case.occluded, case.surface)
+    low, _ = bounds(F, M, case.surface)
     assert np.all(np.diff(low) > 0)
 
 
+def test_points_are_those_that_all_frames_together_measure(models):
+    """Frames are fused one at a time, and come to the paper's Eq. 6 of all of them."""
+    config = replace(AS_IN_THE_PAPER, noise=True, fusion="points", frames=(3,))
+    case = observe(models[0], config)
+    seed = hash_seed(config.seed, *models[0].name.encode())
+    poses = camera.orbit(3, camera_distance(models[0].mesh))
+    captured = capture(models[0].mesh, poses, noise=True, seed=seed)
+    merged = fusion.merge_all(measure_frames(captured))
+    np.testing.assert_array_equal(case.grids.occupied[0], fusion.occupied(merged))
+    np.testing.assert_array_equal(case.grids.occluded[0], fusion.occluded(merged))
+
+
+@pytest.mark.parametrize("name", ["kinect", "realsense", "iphone-lidar"])
+def test_noisy_frames_are_fused_as_distances(models, name):
+    """F and M are soft, as many frames know more than one, and they agree with the truth."""
+    case = observe(models[0], replace(CONFIG, camera=name, frames=(1, 4)))
+    F, M, _ = case.grids
+    assert F.dtype == np.float32 and 0.01 < np.mean((M > 0.1) & (M < 0.9))
+    assert M[1].mean() < M[0].mean()
+    first, last = iou(binary(case.grids).occupied, case.surface)
+    assert 0.2 < first < last
+
+
 def test_noise_depends_on_the_seed_and_the_name(models):
-    noisy = replace(CONFIG, noise=True)
-    clean, first, again = observe(models[0], CONFIG), *(observe(models[0], noisy) for _ in "ab")
-    other = observe(models[0]._replace(name="another"), noisy)
-    np.testing.assert_array_equal(first.occupied, again.occupied)
-    for different in (clean, other):
-        assert np.any(first.occupied != different.occupied)
+    noisy, clean = CONFIG, replace(CONFIG, noise=False)
+    first, again, other = (
+        observe(models[0]._replace(name=name), noisy).grids.occupied
+        for name in ("chair", "chair", "another")
+    )
+    np.testing.assert_array_equal(first, again)
+    assert np.any(first != other)
+    assert np.any(first != observe(models[0]._replace(name="chair"), clean).grids.occupied)
 
 
 def test_any_name_and_a_mesh_of_any_size_can_be_observed():
-    box = trimesh.creation.box((30.0, 50.0, 20.0))
-    case = observe(Model("Möbel/椅子 3", box, {}), replace(CONFIG, frames=(1,)))
-    assert case.occupied.any() and case.surface.any()
+    """A file in millimetres shows the same as one in metres."""
+    box = trimesh.creation.box((0.48, 0.8, 0.36))
+    case, thousandfold = (
+        observe(
+            Model("Möbel/椅子 3", box.copy().apply_scale(scale), {}), replace(CONFIG, frames=(1,))
+        )
+        for scale in (1, 1000)
+    )
+    assert (case.grids.occupied > 0.5).any() and case.surface.any()
+    np.testing.assert_array_equal(case.surface, thousandfold.surface)
+    np.testing.assert_allclose(case.grids.occupied, thousandfold.grids.occupied, atol=1e-3)
 
 
 def test_a_mesh_no_pixel_meets_is_skipped_with_a_reason(linear_prior, models):
@@ -144,7 +186,7 @@ def test_what_methods_have_in_common_is_computed_once(linear_prior):
         run = by_each_method(linear_prior, replace(CONFIG, methods=methods))
         grid = jax.ShapeDtypeStruct((2, 32, 32, 32), bool)
         keys = jax.random.split(jax.random.key(0), 2)
-        return run.lower(keys, linear_prior, grid, grid).compile().cost_analysis()["flops"]
+        return run.lower(keys, linear_prior, Grids(grid, grid)).compile().cost_analysis()["flops"]
 
     both, search, encoder = flops("encoder", "gradient"), flops("gradient"), flops("encoder")
     assert both - search < 0.1 * encoder

@@ -3,7 +3,14 @@ import pytest
 import trimesh
 from scipy.spatial.distance import cdist
 
-from jaxshape.results.metrics import boundary_points, bounds, chamfer_l1, f_score, shape_scores
+from jaxshape.results.metrics import (
+    boundary_points,
+    bounds,
+    chamfer_l1,
+    f_score,
+    occluded_scores,
+    shape_scores,
+)
 from jaxshape.results.surface import voxel_surface
 
 
@@ -26,6 +33,38 @@ def test_bounds_are_named_after_what_occluded_voxels_are_set_to():
     assert float(result.occluded_full) == pytest.approx(8 / 12)
     everything = bounds(occupied, np.ones_like(truth), truth)  # what M hides, F cannot say
     assert float(everything.occluded_empty) == 0
+
+
+def test_occluded_scores_against_loops():
+    """Only voxels that are more likely unknown than not count."""
+    random = np.random.default_rng(0)
+    logits, M = random.normal(0, 2, (5, 5, 5)), random.random((5, 5, 5))
+    truth = random_grids(5, 5, 5)
+    agree, either, losses = 0, 0, []
+    for voxel in np.argwhere(M > 0.5):
+        logit, true = logits[tuple(voxel)], truth[tuple(voxel)]
+        agree += (logit > 0) and true
+        either += (logit > 0) or true
+        p = 1 / (1 + np.exp(-logit))
+        losses.append(-np.log(p if true else 1 - p))
+    found = occluded_scores(logits, M, truth)
+    assert float(found.iou) == pytest.approx(agree / either)
+    assert float(found.cross_entropy) == pytest.approx(np.mean(losses), rel=1e-5)
+
+
+def test_occluded_scores_do_not_depend_on_what_was_measured():
+    logits, M = np.random.default_rng(1).normal(size=(4, 4, 4)), random_grids(4, 4, 4, seed=2)
+    truth = random_grids(4, 4, 4, seed=3)
+    other = occluded_scores(np.where(M, logits, -9.0), M, truth | ~M)
+    assert occluded_scores(logits, M, truth) == other
+
+
+def test_occluded_voxels_without_surface_are_right_where_nothing_fills_them():
+    nothing, hidden = np.zeros((4, 4, 4), bool), box((0, 0, 0), (2, 2, 2), 4)
+    full, empty = np.full((4, 4, 4), 8.0), np.full((4, 4, 4), -8.0)
+    assert float(occluded_scores(empty, hidden, nothing).iou) == 1
+    assert float(occluded_scores(full, hidden, nothing).iou) == 0
+    assert occluded_scores(full, nothing, hidden) == (1, 0)  # nothing is occluded
 
 
 def test_point_distances_against_brute_force():

@@ -8,10 +8,12 @@ import pytest
 import trimesh
 from made_result import T_WORLD_OBJECT, observation, reconstruction, solid
 
+from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.geometry.overlap import iou
 from jaxshape.results import output
 from jaxshape.results.output import write_result
+from jaxshape.results.surface import read_ply
 from jaxshape.results.traces import read_trace
 
 OCCUPIED, OCCLUDED = solid((4, 4, 4), (8, 28, 28)), solid((8, 4, 4), (28, 28, 28))
@@ -76,13 +78,46 @@ def test_the_encoder_alone_leaves_no_trace_of_an_earlier_search(tmp_path):
 
 
 def test_the_mesh_is_closed_and_lies_in_the_world(written):
-    mesh = trimesh.load_mesh(written[0] / "mesh.glb")
+    mesh = trimesh.load_mesh(written[0] / "mesh.ply")
     assert mesh.is_watertight and mesh.volume > 0
     # Voxels 4 to 20, 28 and 28, in metres, carried to the world.
     corners = np.array([[4, 4, 4], [20, 28, 28]]) * [0.02, 0.04, 0.02] - [0.32, 0.64, 0.32]
     world = corners @ T_WORLD_OBJECT[:3, :3].T + T_WORLD_OBJECT[:3, 3]
     np.testing.assert_allclose(mesh.bounds, np.sort(world, axis=0), atol=0.03)
     np.testing.assert_allclose(mesh.volume, 16 * 24 * 24 * 0.02 * 0.04 * 0.02, rtol=0.1)
+
+
+def test_the_glb_stands_upright_in_the_object_frame(written):
+    """Whatever the world is: +y is up in GLB, and in the object frame."""
+    mesh = trimesh.load_mesh(written[0] / "mesh.glb")
+    low, high = np.array([[4, 4, 4], [20, 28, 28]]) * [0.02, 0.04, 0.02] - [0.32, 0.64, 0.32]
+    np.testing.assert_allclose(mesh.bounds, [low, high], atol=0.03)
+
+
+def test_a_measured_surface_is_told_apart_and_counted(tmp_path):
+    """A wall measured half way through the box, before a decoded block, and a speck in the air."""
+    frame = GridFrame(jnp.full(3, -0.32), jnp.full(3, 0.02))
+    x = (np.arange(128) + 0.5) / 4 * 0.02 - 0.32
+    ahead = np.broadcast_to(x[:, None, None], (128,) * 3)  # the wall looks along +x, at x = 0
+    inside = np.abs(x[:, None]) < 0.2
+    beside = (np.abs(ahead) < 0.01) & inside[None] & inside[:, 0]
+    weight = np.where(beside, 5.0, 0.0)
+    field = DistanceField(*map(jnp.float32, (weight * ahead, weight, np.where(ahead > 0.01, 5, 0))))
+    block = solid((4, 6, 6), (16, 26, 26))
+    speck = solid((2, 28, 28), (4, 30, 30))
+    logits = np.where(block | speck, 6.0, -6.0).astype(np.float32)
+    found = RECONSTRUCTION._replace(fill_logits=jnp.asarray(logits)[None])
+    seen = OBSERVATION._replace(frame=frame, field=field, truth=None)
+    result = write_result(tmp_path, seen, found, {})
+    again = read_ply(tmp_path / "mesh.ply")
+    mesh = again.mesh.apply_transform(np.linalg.inv(T_WORLD_OBJECT))
+    assert np.abs(mesh.vertices[again.measured, 0]).max() < 0.004
+    assert (mesh.vertices[~again.measured, 0] < 0.012).all()
+    area = mesh.area_faces[again.measured[mesh.faces].all(axis=1)].sum()
+    assert result["mesh_measured"] == pytest.approx(area / mesh.area, abs=0.03)
+    assert area == pytest.approx(0.4**2, rel=0.15)
+    assert result["mesh_pieces_dropped"] == 1 and again.color is None
+    assert mesh.vertices[:, 1].max() < 0.23  # the speck is gone
 
 
 def test_without_the_truth_no_iou_is_claimed(tmp_path):

@@ -1,6 +1,7 @@
 """What a run leaves on disk, while it runs and when it ends."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,11 +9,15 @@ from PIL import Image
 
 from jaxshape import files
 from jaxshape.data.sequences import read_trajectory
+from jaxshape.mapping.config import MappingConfig
 from jaxshape.mapping.map.recording import trajectory
+from jaxshape.mapping.map.state import assemble
 from jaxshape.report.tables import COLUMNS, keyframe_table
 from jaxshape.results import progress as module
+from jaxshape.results.coloring import NEUTRAL
 from jaxshape.results.folder import read_folder
-from jaxshape.results.progress import counts, observation_of, write_progress
+from jaxshape.results.progress import color_views, counts, observation_of, write_progress
+from jaxshape.results.surface import read_ply
 
 LAST = 8
 
@@ -20,7 +25,7 @@ LAST = 8
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, sequence, steps):
     folder = tmp_path_factory.mktemp("written")
-    result = write_progress(folder, sequence, steps[-1], {"object": "chair"}, 1, running=True)
+    result = write_progress(folder, sequence, steps[-1], {"object": "chair"}, running=True)
     return folder, result
 
 
@@ -77,7 +82,7 @@ def test_trajectories_can_be_read_back(written, steps):
 
 def test_a_result_runs_until_it_is_done(tmp_path, sequence, steps):
     for running in (True, False):
-        result = write_progress(tmp_path, sequence, steps[-1], {}, 1, running=running)
+        result = write_progress(tmp_path, sequence, steps[-1], {}, running=running)
         assert json.loads(json.dumps(result)) == json.loads((tmp_path / "result.json").read_text())
         assert result.get("running", False) == running
     names = {path.name for path in tmp_path.iterdir()}
@@ -108,7 +113,7 @@ def test_each_file_is_replaced_when_whole_and_the_result_last(
         replace(source, target)
 
     monkeypatch.setattr(files.os, "replace", watch)
-    write_progress(tmp_path, sequence, steps[-1], {"object": "earlier"}, 1, running=True)
+    write_progress(tmp_path, sequence, steps[-1], {"object": "earlier"}, running=True)
     assert replaced[-1] == "result.json" and replaced.count("result.json") == 1
     assert set(replaced) == {path.name for path in tmp_path.rglob("*") if path.is_file()}
 
@@ -117,13 +122,42 @@ def test_each_file_is_replaced_when_whole_and_the_result_last(
 
     monkeypatch.setattr(module, "_keyframes", full)
     with pytest.raises(OSError, match="No space"):
-        write_progress(tmp_path, sequence, steps[-1], {"object": "later"}, 1, running=False)
+        write_progress(tmp_path, sequence, steps[-1], {"object": "later"}, running=False)
     assert json.loads((tmp_path / "result.json").read_text())["object"] == "earlier"
     assert not [path for path in tmp_path.rglob(".*")]
 
 
+def test_the_mesh_tells_what_was_measured_and_has_no_colours_without_colour_images(written):
+    folder, result = written
+    found = read_ply(folder / "mesh.ply")
+    assert found.color is None and 0.05 < found.measured.mean() < 0.95
+    assert 0.05 < result["mesh_measured"] < 0.95 and result["mesh_pieces_dropped"] >= 0
+
+
+def test_the_colours_of_the_keyframes_end_on_the_mesh(tmp_path, sequence, steps, walk):
+    """All images are of one colour; so is all that was measured."""
+    files = []
+    for one in sequence.files:
+        path = tmp_path / f"{one.name}.png"
+        Image.fromarray(np.full((*walk.depth.shape[1:], 3), (150, 90, 30), np.uint8)).save(path)
+        files.append(one._replace(color=path))
+    colored = replace(sequence, files=tuple(files))
+    views = list(color_views(colored, steps[-1]))
+    assert len(views) == len(steps[-1].state.keyframes)
+    T_world_object = steps[-1].state.place.box.T_world_object
+    for view, keyframe in zip(views, steps[-1].state.keyframes, strict=True):
+        np.testing.assert_allclose(
+            T_world_object @ view.T_object_camera, keyframe.T_world_camera.as_matrix(), atol=1e-5
+        )
+    write_progress(tmp_path / "out", colored, steps[-1], {}, running=False)
+    found = read_ply(tmp_path / "out" / "mesh.ply")
+    is_painted = (found.color == (150, 90, 30)).all(axis=1)
+    assert is_painted[found.measured].mean() > 0.8
+    assert (found.color[~is_painted] == NEUTRAL).all()
+
+
 def test_depth_frames_to_show_are_cut_to_the_object(steps):
-    observation = observation_of(steps[-1].state, 1)
+    observation = observation_of(steps[-1].state)
     assert len(observation.depth) == min(6, len(steps[-1].state.keyframes))
     for shown, keyframe in zip(observation.depth, steps[-1].state.keyframes, strict=False):
         assert np.isfinite(shown).any(axis=0)[[0, -1]].all()
@@ -133,6 +167,14 @@ def test_depth_frames_to_show_are_cut_to_the_object(steps):
                                       np.asarray(keyframe.depth)[segmented])  # fmt: skip
 
 
-def test_more_hits_are_asked_of_a_voxel(steps):
-    one, three = (observation_of(steps[-1].state, hits).occupied for hits in (1, 3))
-    assert 0 < three.sum() < one.sum() and not np.any(three & ~one)
+def test_more_hits_are_asked_of_a_voxel(steps, known):
+    state = steps[-1].state
+
+    def occupied(hits):
+        mapping = MappingConfig(fusion="points", min_hits=hits)
+        return observation_of(assemble(known, state.place, state.keyframes, state.view, mapping))
+
+    one, three = occupied(1), occupied(3)
+    assert one.field is None and observation_of(state).field is not None
+    assert 0 < three.occupied.sum() < one.occupied.sum()
+    assert not np.any(three.occupied & ~one.occupied)

@@ -1,9 +1,11 @@
+import json
+
 import numpy as np
 import pytest
 import trimesh
 
 from jaxshape.geometry.grid import GridFrame
-from jaxshape.results.surface import surface, voxel_surface, write_mesh
+from jaxshape.results.surface import read_ply, surface, voxel_surface, write_mesh
 
 UNIT = GridFrame(np.zeros(3), np.ones(3))
 
@@ -138,3 +140,83 @@ def test_a_failed_write_leaves_the_earlier_file(tmp_path, monkeypatch):
         write_mesh(trimesh.creation.box(), path)
     assert path.read_bytes() == b"earlier"
     assert list(tmp_path.iterdir()) == [path]
+
+
+# ------------------------------------------------------------------ flags and colours
+
+
+@pytest.fixture(scope="module")
+def painted():
+    """A ball whose upper half was measured and has colours, dark ones too."""
+    mesh = surface(ball(10.0), GridFrame(np.array([1.0, 2, 3]), np.full(3, 0.03)))
+    measured = mesh.vertices[:, 1] > mesh.centroid[1]
+    color = np.random.default_rng(0).integers(0, 256, (len(mesh.vertices), 3), dtype=np.uint8)
+    color[:256] = np.arange(256)[:, None]
+    return mesh, measured, color
+
+
+def test_ply_tells_what_was_measured_and_its_colours(tmp_path, painted):
+    mesh, measured, color = painted
+    write_mesh(mesh, tmp_path / "ball.ply", measured=measured, color=color)
+    found = read_ply(tmp_path / "ball.ply")
+    np.testing.assert_allclose(found.mesh.vertices, mesh.vertices, atol=1e-6)
+    np.testing.assert_array_equal(found.mesh.faces, mesh.faces)
+    np.testing.assert_array_equal(found.measured, measured)
+    np.testing.assert_array_equal(found.color, color)
+    header = (tmp_path / "ball.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "property uchar measured" in header and "property uchar red" in header
+    write_mesh(mesh, tmp_path / "ball.ply")
+    plain = read_ply(tmp_path / "ball.ply")
+    assert plain.measured is None and plain.color is None
+
+
+def content_of_glb(path):
+    """The JSON of a GLB, and a reader of its accessors, by the letter of the standard."""
+    data = path.read_bytes()
+    assert data[:4] == b"glTF" and data[16:20] == b"JSON"
+    length = int.from_bytes(data[12:16], "little")
+    tree, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    parts = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+    def read(number):
+        accessor = tree["accessors"][number]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        assert "byteStride" not in view
+        kind = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        count = accessor["count"] * parts[accessor["type"]]
+        return np.frombuffer(binary, kind, count, start).reshape(accessor["count"], -1)
+
+    return tree, read
+
+
+def test_glb_holds_flags_linear_colours_and_normals_and_no_turned_node(tmp_path, painted):
+    """What three.js and Blender read: POSITION as given, +y up, below nodes that turn nothing."""
+    mesh, measured, color = painted
+    write_mesh(mesh, tmp_path / "ball.glb", measured=measured, color=color)
+    tree, read = content_of_glb(tmp_path / "ball.glb")
+    assert not any({"matrix", "rotation", "scale"} & set(node) for node in tree["nodes"])
+    ((part,),) = (one["primitives"] for one in tree["meshes"])
+    values = {name: read(number) for name, number in part["attributes"].items()}
+    assert set(values) == {"POSITION", "NORMAL", "COLOR_0", "_MEASURED"}
+    np.testing.assert_allclose(values["POSITION"], mesh.vertices, atol=1e-6)
+    np.testing.assert_array_equal(read(part["indices"]).reshape(-1, 3), mesh.faces)
+    outwards = ((values["POSITION"] - mesh.centroid) * values["NORMAL"]).sum(axis=1)
+    assert (outwards > 0).all()
+    np.testing.assert_array_equal(values["_MEASURED"][:, 0], measured)
+    linear = values["COLOR_0"][:, :3].astype(float)
+    again = np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+    np.testing.assert_allclose(255 * again, color, atol=0.01)
+    assert tree["materials"][part["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
+    loaded = trimesh.load_mesh(tmp_path / "ball.glb", process=False)
+    np.testing.assert_array_equal(loaded.vertex_attributes["_MEASURED"][:, 0], measured)
+
+
+@pytest.mark.parametrize("damage", ["no faces", "not finite"])
+def test_a_ply_of_no_surface_is_refused(tmp_path, damage):
+    mesh = trimesh.creation.box()
+    vertices = np.full_like(mesh.vertices, np.nan) if damage == "not finite" else mesh.vertices
+    faces = mesh.faces[:0] if damage == "no faces" else mesh.faces
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "bad.ply")
+    with pytest.raises(ValueError):
+        read_ply(tmp_path / "bad.ply")

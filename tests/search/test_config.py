@@ -14,6 +14,7 @@ pytestmark = pytest.mark.usefixtures("unchecked_types")
     "changed, message",
     [
         ({"objective": "balanced "}, "objective is 'balanced '; give 'balanced' or 'paper'"),
+        ({"symmetry": "yes"}, "symmetry is 'yes'; give True or False"),
         ({"space": "white"}, "space is 'white'; give 'whitened' or 'raw'"),
         ({"precision": "float16"}, "precision is 'float16'; give 'float32' or 'bfloat16'"),
         ({"iterations": 0}, "iterations is 0; give a whole number, 1 or more"),

@@ -13,10 +13,10 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.pca import PCA
 from jaxshape.model.shapes import decode, encode
+from jaxshape.search.composition import complete, compose
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import (
     code_penalty,
-    compose,
     fit_surface,
     reconstruct,
     reconstruct_jit,
@@ -25,7 +25,7 @@ from jaxshape.search.reconstruction import (
     search_space,
 )
 from jaxshape.search.refiner import StopReason
-from jaxshape.search.residuals import BALANCED, PAPER, Residual, cross_entropy
+from jaxshape.search.residuals import BALANCED, PAPER, RESIDUALS, Residual, cross_entropy
 
 KEY = jax.random.key(0)
 KEYS = jax.random.split(KEY, 2)
@@ -85,9 +85,31 @@ def test_all_fields_belong_to_the_refined_code(linear_prior, searched):
     first_logits = decode(linear_prior, searched.first_code)
     loss = cross_entropy(searched.logits, BALANCED.target(GRIDS, first_logits))
     np.testing.assert_allclose(searched.objective, loss, rtol=1e-5)
-    np.testing.assert_array_equal(
-        searched.composed, compose(OCCUPIED, OCCLUDED, searched.completed)
-    )
+    filled = complete(GRIDS, searched.logits, symmetry=True)
+    np.testing.assert_array_equal(searched.composed, filled.composed)
+    np.testing.assert_allclose(searched.fill_logits, filled.logits, atol=1e-5)
+    np.testing.assert_array_equal(searched.symmetric, filled.symmetric)
+
+
+def test_without_symmetry_the_composed_shape_is_that_of_the_paper(linear_prior, encoded):
+    plain = reconstruct_jit(None, replace(CONFIG, symmetry=False))
+    found = plain(KEYS, linear_prior, OCCUPIED, OCCLUDED)
+    np.testing.assert_array_equal(found.composed, compose(OCCUPIED, OCCLUDED, found.completed))
+    np.testing.assert_array_equal(found.completed, encoded.completed)
+    assert found.symmetric is None and found.agreement is None
+
+
+def test_soft_grids_are_searched_by_the_soft_residual_and_binary_ones_by_the_balanced(linear_prior):
+    """Unless the settings name one."""
+    soft = Grids(jnp.where(OCCUPIED, 0.8, 0.3), jnp.where(OCCLUDED, 0.7, 0.1))
+    for grids, name in ((soft, "soft"), (GRIDS, "balanced")):
+        for objective in (None, "paper"):
+            run = reconstruct_jit(None, replace(CONFIG, objective=objective))
+            found = run(KEYS, linear_prior, grids.occupied, grids.occluded)
+            residual = RESIDUALS[objective or name]
+            targets = jax.vmap(residual.target)(grids, found.logits)
+            expected = jax.vmap(residual.score)(found.logits, targets)
+            np.testing.assert_allclose(found.objective, expected, rtol=1e-5)
 
 
 def test_the_paper_objective_weighs_free_space_in_full(linear_prior, encoded):
@@ -255,7 +277,7 @@ def test_own_data_reaches_the_residual_of_its_object(linear_prior):
 def test_soft_grids_compose_by_probability(linear_prior):
     """Surface that is surely measured stays; half-known voxels follow the more likely."""
     soft = jnp.where(OCCUPIED, 0.8, 0.3), jnp.where(OCCLUDED, 0.7, 0.1)
-    found = reconstruct_jit(None, replace(CONFIG, objective="soft"))(KEYS, linear_prior, *soft)
+    found = reconstruct_jit(None, replace(CONFIG, symmetry=False))(KEYS, linear_prior, *soft)
     F, M = (np.asarray(x, np.float64) for x in soft)
     p = 1 / (1 + np.exp(-np.float64(found.logits)))
     mixed = (1 - M) * F + M * p

@@ -25,6 +25,7 @@ import jaxlie
 from jaxtyping import Array, Key
 
 from jaxshape.data.boxes import Box
+from jaxshape.geometry.grids import binary
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.localization import has_moved, localize, moved_to
 from jaxshape.mapping.map.state import (
@@ -168,7 +169,14 @@ def _init(
     """The map of a first frame."""
     place = place_of(box, parts.prior.resolution, room, isotropic=parts.mapping.isotropic)
     first = keyframe_of(prepared, place, T_world_camera, None)
-    state = assemble(parts.prior, place, (first,), prepared.view, poses_are_given=poses_are_given)
+    state = assemble(
+        parts.prior,
+        place,
+        (first,),
+        prepared.view,
+        parts.mapping,
+        poses_are_given=poses_are_given,
+    )
     clock = _Clock()
     state, shape = _refined(parts, state, parts.run_short)
     clock.lap("refine", state)
@@ -226,11 +234,12 @@ def _refined(
     parts: _Parts, state: MapState, run: Callable[..., Reconstruction]
 ) -> tuple[MapState, Reconstruction | None]:
     """The shape of what is fused so far, searched on from the one before."""
-    occupied, occluded = grids_of(state.measurement, parts.mapping.min_hits)
-    if not bool(occupied.any()):
+    grids = grids_of(state)
+    if not bool(binary(grids).occupied.any()):
         return state, None
     keys = jax.random.fold_in(parts.key, len(state.keyframes))[None]
-    shape = run(keys, parts.prior, occupied[None], occluded[None], earlier=state.code[None])
+    occupied, occluded = grids.occupied[None], grids.occluded[None]
+    shape = run(keys, parts.prior, occupied, occluded, earlier=state.code[None])
     state = state._replace(code=shape.code[0], logits=shape.logits[0])
     return with_surface(state), shape
 
@@ -250,6 +259,7 @@ def _moved(
         place,
         tuple(cut_anew(one, place) for one in state.keyframes),
         state.view,
+        parts.mapping,
         T_world_camera=state.T_world_camera,
         T_before_last=state.T_before_last,
         poses_are_given=state.poses_are_given,

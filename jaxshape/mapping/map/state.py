@@ -1,7 +1,7 @@
 """The state of a map: keyframes, what they add up to, and the shape that explains it. [host]"""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,17 +9,39 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxshape.geometry import fusion
+from jaxshape.geometry.distance import DistanceField
+from jaxshape.geometry.fusing import Fusion, fusion_named
 from jaxshape.geometry.fusion import Measurement
+from jaxshape.geometry.grids import Grids
+from jaxshape.geometry.pixels import Sensor
+from jaxshape.mapping.config import MappingConfig
 from jaxshape.mapping.map.realign import Odometry, realign
 from jaxshape.mapping.tracking import surfels
 from jaxshape.mapping.tracking.icp import Alignment
-from jaxshape.mapping.tracking.keyframes import Keyframe, Place
+from jaxshape.mapping.tracking.keyframes import Keyframe, Place, to_fuse
 from jaxshape.mapping.tracking.surfels import Lattice, Sums, Surface
 from jaxshape.mapping.tracking.views import DepthView
 from jaxshape.model.shapes import ShapePrior
 
 _LEAST_CAPACITY = 8  # keyframes for which realigning is compiled, even where there are fewer
+
+
+class Fusing(NamedTuple):
+    """How keyframes become one measurement; hashable, so that it can be static under jit.
+
+    Attributes:
+        fusion: By points or by signed distances.
+        sensor: How the noise of the camera's depth grows.
+    """
+
+    fusion: Fusion
+    sensor: Sensor
+
+
+def fusing_of(mapping: MappingConfig, resolution: int) -> Fusing:
+    """The way to fuse keyframes that the settings ask for, at the resolution of a prior."""
+    fusion = fusion_named(mapping.fusion, resolution, mapping.min_hits)
+    return Fusing(fusion, Sensor(axial=mapping.depth_noise))
 
 
 class MapState(NamedTuple):
@@ -28,7 +50,8 @@ class MapState(NamedTuple):
     Attributes:
         keyframes: Keyframes so far, with their present poses.
         place: Where the object's grids lie in the world.
-        measurement: Measurement fused from all keyframes.
+        fusing: The way in which keyframes are fused.
+        measurement: Measurement fused from all keyframes: of the kind that `fusing` makes.
         sums: Sums of measured points in each cell, from which the measured surface is made.
         code: Code of the shape as last refined `[d]`; the mean code before anything was measured.
         logits: Logits of that shape `[x y z]`; -inf before anything was measured.
@@ -41,7 +64,8 @@ class MapState(NamedTuple):
 
     keyframes: tuple[Keyframe, ...]
     place: Place
-    measurement: Measurement
+    fusing: Fusing
+    measurement: Measurement | DistanceField
     sums: Sums
     code: Float[Array, " d"]
     logits: Float[Array, "x y z"]
@@ -57,6 +81,7 @@ def assemble(
     place: Place,
     keyframes: tuple[Keyframe, ...],
     view: DepthView,
+    mapping: MappingConfig,
     *,
     code: Float[Array, " d"] | None = None,
     logits: Float[Array, "x y z"] | None = None,
@@ -71,16 +96,19 @@ def assemble(
         place: Where the object's grids lie in the world.
         keyframes: The keyframes, one or more.
         view: View of the last keyframe.
+        mapping: Settings, of which the way to fuse keyframes matters here.
         code: Code of the shape found so far `[d]`; None for the mean code.
         logits: Logits of that shape `[x y z]`; None before anything was measured.
         T_world_camera: Pose of the last frame that was tracked; None for that of the last keyframe.
         T_before_last: Motion of the camera before that frame; None where there was none since.
         poses_are_given: Whether the poses were given.
     """
+    fusing = fusing_of(mapping, prior.resolution)
     state = MapState(
         keyframes=keyframes,
         place=place,
-        measurement=fusion.nothing_measured(prior.resolution),
+        fusing=fusing,
+        measurement=fusing.fusion.nothing(),
         sums=surfels.no_sums(),
         code=prior.code_mean if code is None else code,
         logits=jnp.full((prior.resolution,) * 3, -jnp.inf) if logits is None else logits,
@@ -95,7 +123,7 @@ def assemble(
 
 def fused_anew(state: MapState) -> MapState:
     """The state with F, M and the measured surface made from all keyframes where they are now."""
-    nothing = fusion.nothing_measured(state.logits.shape[-1])
+    nothing = state.fusing.fusion.nothing()
     state = state._replace(measurement=nothing, sums=surfels.no_sums())
     for keyframe in state.keyframes:
         state = added(state, keyframe)
@@ -108,33 +136,34 @@ def added(state: MapState, keyframe: Keyframe) -> MapState:
         jnp.float32(np.linalg.inv(state.place.box.T_world_object))
     )
     measurement, sums = _add(
-        state.measurement, state.sums, keyframe, T_object_world, state.place.frame,
+        state.fusing, state.measurement, state.sums, keyframe, T_object_world, state.place.frame,
         state.place.lattice,
     )  # fmt: skip
     return state._replace(measurement=measurement, sums=sums)
 
 
-@jax.jit
-def _add(measurement, sums, keyframe: Keyframe, T_object_world, frame, lattice):
+@partial(jax.jit, static_argnums=0)
+def _add(
+    fusing: Fusing, measurement: Any, sums, keyframe: Keyframe, T_object_world, frame, lattice
+):
     T_object_camera = T_object_world @ keyframe.T_world_camera
-    new = fusion.measure(
-        keyframe.depth,
-        keyframe.segmented,
-        keyframe.intrinsics,
-        T_object_camera,
-        frame,
-        measurement.hits.shape[-1],
-    )
+    (depth, intrinsics), segmented = to_fuse(keyframe)
+    fusion, sensor = fusing
+    new: Any = fusion.measure(depth, segmented, intrinsics, T_object_camera, frame, sensor)
     R = keyframe.T_world_camera.rotation().as_matrix()
     points = keyframe.cloud.points @ R.T + keyframe.T_world_camera.translation()
     more = surfels.add_up(lattice, points, keyframe.cloud.normals @ R.T, keyframe.cloud.deviation)
     return fusion.merge(measurement, new), jax.tree.map(jnp.add, sums, more)
 
 
-@partial(jax.jit, static_argnums=1)
-def grids_of(measurement: Measurement, min_hits: int):
-    """F and M of a measurement."""
-    return fusion.occupied(measurement, min_hits), fusion.occluded(measurement, min_hits)
+def grids_of(state: MapState) -> Grids:
+    """F and M of all keyframes: binary by points, soft by signed distances."""
+    return _grids(state.fusing.fusion, state.measurement)
+
+
+@partial(jax.jit, static_argnums=0)
+def _grids(fusion: Fusion, measurement: Any) -> Grids:
+    return fusion.grids(measurement)
 
 
 def odometry_of(

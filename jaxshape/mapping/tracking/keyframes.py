@@ -26,16 +26,31 @@ WORKING_WIDTH = 400
 _STRIDE = 2  # pixels between the points that a keyframe keeps
 
 
+class DepthImage(NamedTuple):
+    """A depth image as it was recorded.
+
+    Attributes:
+        depth: Depth image `[h w]`, in metres; 0 where nothing is known, infinite where the ray met
+            nothing.
+        intrinsics: The camera.
+    """
+
+    depth: Float[Array, "h w"]
+    intrinsics: Intrinsics
+
+
 class PreparedFrame(NamedTuple):
     """One frame, prepared for tracking and mapping.
 
     Attributes:
         view: Depth image at working size, with its oriented points.
         masked: Pixels that may show the object `[h w]`: a given mask, or all.
+        recorded: The depth image in full size; None where that is the working size.
     """
 
     view: DepthView
     masked: Bool[Array, "h w"]
+    recorded: DepthImage | None = None
 
 
 # Pixels that may show the object, from its box and the pose of the camera, both in the world.
@@ -56,6 +71,7 @@ class Keyframe(NamedTuple):
         T_previous_keyframe: Tracked pose relative to the keyframe before.
         information: Inverse covariance of that relative pose `[6 6]`, in the frame of the keyframe
             before; 0 for the first.
+        recorded: The depth image in full size, which is fused; None where that is the working size.
     """
 
     depth: Float[Array, "h w"]
@@ -66,6 +82,7 @@ class Keyframe(NamedTuple):
     T_world_camera: jaxlie.SE3
     T_previous_keyframe: jaxlie.SE3
     information: Float[Array, "6 6"]
+    recorded: DepthImage | None = None
 
 
 class Place(NamedTuple):
@@ -135,7 +152,18 @@ def keyframe_of(
         T_world_camera=T_world_camera,
         T_previous_keyframe=T_previous,
         information=information,
+        recorded=prepared.recorded,
     )
+
+
+def to_fuse(keyframe: Keyframe) -> tuple[DepthImage, Bool[Array, "h w"]]:
+    """The depth image of a keyframe in full size, and its pixels that show the object."""
+    if keyframe.recorded is None:
+        return DepthImage(keyframe.depth, keyframe.intrinsics), keyframe.segmented
+    (h, w), (rows, columns) = keyframe.recorded.depth.shape, keyframe.segmented.shape
+    segmented = keyframe.segmented.repeat(h // rows, axis=0).repeat(w // columns, axis=1)
+    missing = [(0, n - m) for n, m in zip((h, w), segmented.shape, strict=True)]
+    return keyframe.recorded, jnp.pad(segmented, missing)
 
 
 def cut_anew(keyframe: Keyframe, place: Place) -> Keyframe:
@@ -176,11 +204,12 @@ def prepare(
     halvings = 0
     while frame.depth.shape[1] >> halvings > WORKING_WIDTH:
         halvings += 1
-    view = _view(jnp.asarray(frame.depth), intrinsics_of(K), halvings)
+    image = DepthImage(jnp.asarray(frame.depth), intrinsics_of(K))
+    view = _view(*image, halvings)
     mask = frame.mask if masked is None else masked
-    if mask is None:
-        return PreparedFrame(view, jnp.ones(view.depth.shape, bool))
-    return PreparedFrame(view, resized(mask, view.depth.shape))
+    shape = view.depth.shape
+    may_show = jnp.ones(shape, bool) if mask is None else resized(mask, shape)
+    return PreparedFrame(view, may_show, image if halvings else None)
 
 
 @partial(jax.jit, static_argnums=2)

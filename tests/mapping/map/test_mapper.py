@@ -4,15 +4,17 @@ import jaxlie
 import numpy as np
 import pytest
 from analytic_room import CHAIR, CRATE, FLOOR, TABLE, WALLS, K, room
+from scipy import ndimage
 
 from jaxshape.data.boxes import Box
-from jaxshape.geometry import fusion, grid
-from jaxshape.geometry.camera import intrinsics_of
+from jaxshape.geometry import distance, fusion, grid
+from jaxshape.geometry.camera import Intrinsics, intrinsics_of
+from jaxshape.geometry.grids import binary
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import build_mapper
-from jaxshape.mapping.map.state import fused_anew
+from jaxshape.mapping.map.state import assemble, fused_anew, grids_of
 from jaxshape.mapping.tracking import registration, surfels
-from jaxshape.mapping.tracking.keyframes import PreparedFrame, place_of
+from jaxshape.mapping.tracking.keyframes import DepthImage, PreparedFrame, keyframe_of, place_of
 from jaxshape.mapping.tracking.views import view_of
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
@@ -48,7 +50,9 @@ POSES = [as_pose(one.T_world_camera) for one in ROOMS]
 def build(shy_prior):
     """Builds mappers that share what is compiled."""
     search = RefineConfig(iterations=2, population=4)
-    settings = MappingConfig(keyframe_iterations=2, keyframe_distance=0.15, min_hits=1)
+    settings = MappingConfig(
+        keyframe_iterations=2, keyframe_distance=0.15, fusion="points", min_hits=1
+    )
     refiner = refiner_for("cma", shy_prior, search)
     return lambda: build_mapper(shy_prior, refiner, search, settings, TrackingConfig())
 
@@ -136,6 +140,44 @@ def test_the_map_is_what_all_its_keyframes_measure_at_once(run):
 
 
 fuse = jax.jit(fusion.measure)
+
+
+def test_by_distances_too_the_map_is_what_all_keyframes_measure(run, shy_prior):
+    """And its F is the one by points, but for voxels beside the surface."""
+    state = run[0][-1]
+    by = MappingConfig(fusion="distance")
+    mapped = assemble(shy_prior, state.place, state.keyframes, state.view, by)
+    fields = []
+    for one in state.keyframes:
+        T = as_pose(np.linalg.inv(T_WORLD_OBJECT)) @ one.T_world_camera
+        fields.append(apart(one.depth, one.segmented, one.intrinsics, T, state.place.frame))
+    whole = distance.merge_all(jax.tree.map(lambda *x: jnp.stack(x), *fields))
+    for ours, theirs in zip(mapped.measurement, whole, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    F = np.asarray(binary(grids_of(mapped)).occupied)
+    points = np.asarray(binary(grids_of(state)).occupied)
+    assert (F & ~ndimage.binary_dilation(points)).sum() < 0.05 * F.sum() and F.sum() > 100
+
+
+apart = jax.jit(distance.measure)
+
+
+def test_a_frame_is_fused_in_full_size_and_tracked_in_half(shy_prior):
+    """Twice as many pixels of the same scene give the same F where the small ones do."""
+    wide = jnp.repeat(jnp.repeat(jnp.float32(ROOMS[0].depth), 2, axis=0), 2, axis=1)
+    lens = Intrinsics(*(2 * x for x in LENS))
+    whole = SHOTS[0]._replace(recorded=DepthImage(wide, lens))
+    by = MappingConfig(fusion="points", min_hits=1)
+    hits = []
+    for prepared in (SHOTS[0], whole):
+        place = place_of(BOX, 32)
+        keyframe = keyframe_of(prepared, place, POSES[0], None)
+        assert keyframe.depth.shape == ROOMS[0].depth.shape
+        state = assemble(shy_prior, place, (keyframe,), prepared.view, by)
+        hits.append(np.asarray(state.measurement.hits))
+    small, large = hits
+    np.testing.assert_allclose(large.sum(), 4 * small.sum(), rtol=0.01)
+    assert ((large > 0) >= (small > 0)).mean() > 0.999
 
 
 def test_two_runs_of_two_mappers_are_the_same(build, run):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from jaxshape.data.boxes import Box
 from jaxshape.geometry.camera import Intrinsics
+from jaxshape.mapping.config import MappingConfig
 from jaxshape.mapping.map import state as map_state
 from jaxshape.mapping.map.state import assemble, capacity_for, realigned_poses
 from jaxshape.mapping.tracking.keyframes import PreparedFrame, keyframe_of, place_of
@@ -41,7 +42,7 @@ def test_a_map_of_more_than_512_keyframes_is_realigned(monkeypatch, linear_prior
     first = keyframe_of(prepared, place, jaxlie.SE3.identity(), odometry)
     poses = np.float32([[1, 0, 0, 0, 0.01 * i, 0, 0] for i in range(513)])
     keyframes = tuple(first._replace(T_world_camera=jaxlie.SE3(pose)) for pose in poses)
-    few = assemble(linear_prior, place, (first,), prepared.view)
+    few = assemble(linear_prior, place, (first,), prepared.view, MappingConfig())
     found = realigned_poses(few._replace(keyframes=keyframes))
     np.testing.assert_array_equal([T.wxyz_xyz for T in found], poses)
     ((is_keyframe, is_fixed, information),) = asked

@@ -1,0 +1,42 @@
+"""The colours in which a mesh can be shown: those of the frames, or by where it comes from."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxshape.report.palette import COLORS
+from jaxshape.report.pictures import rgb
+from jaxshape.results.folder import ResultFolder
+
+
+class Paint(NamedTuple):
+    """Colours of the vertices of a mesh.
+
+    Attributes:
+        label: Text that names them.
+        colors: One colour for each vertex.
+    """
+
+    label: str
+    colors: UInt8[np.ndarray, "n 3"]
+
+
+def paints(found: ResultFolder) -> dict[str, Paint]:
+    """The colours in which the mesh of a result can be shown, by name; the first is shown first.
+
+    Args:
+        found: The result. Meshes of older results, and of points, have neither.
+
+    Returns:
+        "color" where frames gave the mesh colours, and "source" where it is known which vertices
+        were measured.
+    """
+    there = {}
+    if found.color is not None:
+        there["color"] = Paint("colours of the frames", found.color)
+    if found.measured is not None:
+        blue, orange = (np.uint8(255 * rgb(COLORS[name])) for name in ("measured", "predicted"))
+        by_source = np.where(found.measured[:, None], blue, orange)
+        there["source"] = Paint("measured (blue), predicted (orange)", by_source)
+    return there

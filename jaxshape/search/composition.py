@@ -1,0 +1,62 @@
+"""The composed shape: what was measured, and what fills the rest (paper, section 2.4)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxshape.geometry.evidence import from_grids
+from jaxshape.geometry.grids import Grid, Grids
+from jaxshape.geometry.symmetry import mirrored, symmetrised
+
+
+class Composition(NamedTuple):
+    """A composed shape, and what fills it; leading axes are batch axes.
+
+    Attributes:
+        composed: What was measured where something was, the filling elsewhere `[*batch x y z]`.
+        logits: Logits of the filling `[*batch x y z]`.
+        symmetric: Whether the filling is mirrored `[*batch]`; None where that was not asked for.
+        agreement: Share of the surface measured on both sides that agrees, 0 to 1 `[*batch]`; None
+            where that was not asked for.
+    """
+
+    composed: Bool[Array, "*batch x y z"]
+    logits: Float[Array, "*batch x y z"]
+    symmetric: Bool[Array, "*batch"] | None
+    agreement: Float[Array, "*batch"] | None
+
+
+def complete(grids: Grids, logits: Float[Array, "*batch x y z"], *, symmetry: bool) -> Composition:
+    """Fill what was not measured with a decoded shape, and with the mirror image of what was.
+
+    Args:
+        grids: F and M of the objects `[*batch x y z]`, binary or soft.
+        logits: Logits of their decoded shapes `[*batch x y z]`.
+        symmetry: Average each decoded shape with its mirror image, and add what the other side
+            showed, where the measured halves agree.
+    """
+    symmetric = agreement = None
+    if symmetry:
+        other = mirrored(from_grids(grids))
+        logits = symmetrised(logits, other)
+        symmetric, agreement = other.symmetric, other.agreement
+    composed = compose(grids.occupied, grids.occluded, jax.nn.sigmoid(logits))
+    return Composition(composed, logits, symmetric, agreement)
+
+
+def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*batch x y z"]:
+    """Keep what was observed as measured; fill what was occluded with the completed shape.
+
+    Args:
+        occupied: F `[*batch x y z]`, binary or soft.
+        occluded: M `[*batch x y z]`, binary or soft.
+        completed: The decoded shape `[*batch x y z]`: True where occupied, or its probability.
+
+    Returns:
+        The composed shape `[*batch x y z]`: True where (1 - M) F + M p is above 1/2. For binary
+        grids that is F where something was measured, and the completed shape elsewhere.
+    """
+    F, M, p = (jnp.asarray(x).astype(jnp.float32) for x in (occupied, occluded, completed))
+    return (1 - M) * F + M * p > 0.5

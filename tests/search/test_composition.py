@@ -1,0 +1,80 @@
+"""The composed shape keeps what was measured; its mirror image tells of what is hidden."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxshape.geometry.grids import Grids
+from jaxshape.geometry.symmetry import mirror
+from jaxshape.search.composition import complete, compose
+
+KEY = jax.random.key(0)
+LOGITS = jax.random.normal(KEY, (2, 16, 16, 16))
+
+
+def half_seen(*, symmetric=True) -> Grids:
+    """A symmetric object of which the left half was measured, and of the right only a leg."""
+    surface = jax.random.bernoulli(jax.random.key(1), 0.2, (16, 16, 16))
+    surface = surface.at[6:10].set(False)
+    surface = surface.at[:8].set(surface[:8] & mirror(surface)[:8])
+    surface = surface.at[2:5, :4, 2:5].set(False).at[3, :4, 3].set(True)
+    surface = surface | mirror(surface)
+    if not symmetric:  # the leg of the right stands elsewhere, and more of it was seen
+        surface = surface.at[8:].set(False).at[12, :, 10:14].set(True)
+        surface = surface.at[1:6, :, 8:].set(False)
+    hidden = jnp.ones((16, 16, 16), bool).at[:8].set(False)
+    leg = jnp.s_[11:15, :4, 2:5] if symmetric else jnp.s_[11:15, :, 8:]
+    hidden = hidden.at[leg].set(False)
+    return Grids(surface & ~hidden, hidden)
+
+
+def batch(*grids: Grids) -> Grids:
+    return jax.tree.map(lambda *x: jnp.stack(x), *grids)
+
+
+def test_what_is_hidden_is_the_mirror_image_of_what_was_seen():
+    """Where a decoded shape is not sure of anything, the other side decides."""
+    grids = half_seen()
+    found = complete(grids, 0.5 * LOGITS[0], symmetry=True)
+    assert bool(found.symmetric) and float(found.agreement) == 1
+    whole = grids.occupied | mirror(grids.occupied)
+    np.testing.assert_array_equal(found.composed[8:], whole[8:])
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_each_object_decides_for_itself(soft):
+    """One whose halves disagree is filled as if symmetry had not been asked for."""
+    grids = batch(half_seen(), half_seen(symmetric=False))
+    if soft:
+        F, M, _ = grids
+        grids = Grids(jnp.where(F, 0.95, 0.02), jnp.where(M, 0.98, 0.01))
+    plain, found = (complete(grids, LOGITS, symmetry=symmetry) for symmetry in (False, True))
+    np.testing.assert_array_equal(found.symmetric, [True, False])
+    assert found.agreement[0] > 0.9 and found.agreement[1] < 0.5
+    np.testing.assert_array_equal(found.logits[1], LOGITS[1])
+    np.testing.assert_array_equal(found.composed[1], plain.composed[1])
+    assert np.any(found.composed[0] != plain.composed[0])
+
+
+def test_what_was_measured_stays():
+    grids = batch(half_seen(), half_seen(symmetric=False))
+    composed = np.asarray(complete(grids, LOGITS, symmetry=True).composed)
+    seen = ~np.asarray(grids.occluded)
+    np.testing.assert_array_equal(composed[seen], np.asarray(grids.occupied)[seen])
+
+
+def test_without_symmetry_the_decoded_shape_fills_what_is_hidden():
+    grids = batch(half_seen(), half_seen(symmetric=False))
+    found = complete(grids, LOGITS, symmetry=False)
+    assert found.symmetric is None and found.agreement is None
+    np.testing.assert_array_equal(found.logits, LOGITS)
+    np.testing.assert_array_equal(found.composed, compose(*grids[:2], LOGITS > 0))
+
+
+def test_objects_of_a_batch_are_independent():
+    grids = batch(half_seen(), half_seen(symmetric=False))
+    both = complete(grids, LOGITS, symmetry=True)
+    for i in range(2):
+        one = complete(jax.tree.map(lambda x, i=i: x[i], grids), LOGITS[i], symmetry=True)
+        jax.tree.map(lambda x, y, i=i: np.testing.assert_allclose(x[i], y, atol=1e-6), both, one)
