@@ -24,7 +24,7 @@ REACH, FIN = 6.0, 1.6
 """Fine voxels over which measured distances fade out beyond the edge of what was measured; and the
 same where they are solid and the decoded shape is free."""
 
-ROUNDS = 10
+ROUNDS = 30
 """Rounds of Taubin's filter, which take off the grain that the noise of few frames leaves. On CAD
 seats the measured surface gets more exact by it; averaging the distances themselves makes it less
 so, for it moves the sides of thin parts."""
