@@ -120,5 +120,7 @@ def _fused(
     numbers: tuple[int, ...],
     sensor: Sensor,
 ) -> Grids:
-    depth, segmented, T = frames
-    return fuse_cumulative(fusing, numbers, depth, segmented, intrinsics, T, frame, sensor)
+    depth, segmented = jnp.asarray(frames.depth), jnp.asarray(frames.segmented)
+    return fuse_cumulative(
+        fusing, numbers, depth, segmented, intrinsics, frames.T_object_camera, frame, sensor
+    )

@@ -7,9 +7,10 @@ F (1 - M), (1 - F) (1 - M) and M, which sum to 1.
 
 from typing import Any, NamedTuple
 
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-Grid = Bool[Array, "*batch x y z"] | Float[Array, "*batch x y z"]
+Grid = Bool[Array | np.ndarray, "*batch x y z"] | Float[Array | np.ndarray, "*batch x y z"]
 
 
 class Grids(NamedTuple):

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from jaxshape.geometry.grids import Grids
@@ -197,7 +198,10 @@ def decode_skips(
 
 
 def posterior(
-    params: PyTree, grids: Grids, surface: Bool[Array, "b x y z"], dtype: Any = jnp.float32
+    params: PyTree,
+    grids: Grids,
+    surface: Bool[Array | np.ndarray, "b x y z"],
+    dtype: Any = jnp.float32,
 ) -> tuple[Float[Array, "b d"], Float[Array, "b d"]]:
     """Mean and log-variance of the codes that lead to a complete surface."""
     net = params["posterior"]

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
@@ -22,9 +23,9 @@ class Batch(NamedTuple):
         surface: Complete surface Y `[b x y z]`.
     """
 
-    occupied: Float[Array, "b x y z"]
-    occluded: Float[Array, "b x y z"]
-    surface: Bool[Array, "b x y z"]
+    occupied: Float[Array | np.ndarray, "b x y z"]
+    occluded: Float[Array | np.ndarray, "b x y z"]
+    surface: Bool[Array | np.ndarray, "b x y z"]
 
     @property
     def grids(self) -> Grids:
@@ -89,6 +90,7 @@ def cross_entropy(
 def autoencoder_cost(variables, batch: Batch, noise, config: TrainConfig, axis) -> Cost:
     """Cross-entropy of the decoded code of F, and what the code's length costs."""
     dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32
+    assert isinstance(config.architecture, Architecture)
     network = autoencoder.AutoEncoder(config.architecture, dtype, axis)
     (logits, code), updates = network.apply(
         variables,
@@ -99,7 +101,7 @@ def autoencoder_cost(variables, batch: Batch, noise, config: TrainConfig, axis) 
     )
     length = 0.5 * jnp.mean(jnp.sum(code**2, axis=-1)) / batch.surface[0].size
     loss = cross_entropy(logits, batch, config) + config.code_weight * length
-    return Cost(loss, updates, logits > 0)
+    return Cost(loss, dict(updates), logits > 0)
 
 
 AUTOENCODERS = Family(
