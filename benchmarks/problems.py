@@ -38,7 +38,7 @@ class Problem(NamedTuple):
 @lru_cache
 def chairs(count: int, frames: int = 4) -> Problem:
     """The first test chairs, after some frames of an orbit."""
-    prior = js.load_prior()
+    prior = js.load_prior("chair-autoencoder")
     measured, surface = zip(*[_look_at(FIRST_CHAIR + i, frames) for i in range(count)], strict=True)
     measured, surface = jax.tree.map(lambda *x: jnp.stack(x), *measured), jnp.stack(surface)
     F, M = js.occupied(measured), js.occluded(measured)

@@ -40,7 +40,7 @@ def first_result() -> dict[str, float]:
 
     js.reconstruct, js.load_prior, js.refiner_for  # noqa: B018 (imported when first named)
     clock("import")
-    prior = js.load_prior()
+    prior = js.load_prior("chair-autoencoder")
     config = js.RefineConfig(iterations=ITERATIONS)
     search = js.refiner_for("cma", prior, config)
     clock("load")

@@ -262,7 +262,7 @@ def _parts(steps: list[Step]) -> list[Metric]:
 
 
 def _mapper():
-    prior, search, settings = js.load_prior(), RefineConfig(), MappingConfig()
+    prior, search, settings = js.load_prior("chair-autoencoder"), RefineConfig(), MappingConfig()
     refiner = refiner_for("cma", prior, search)
     return build_mapper(prior, refiner, search, settings, TrackingConfig())
 

@@ -72,7 +72,7 @@ class Config:
     """Of every search, none of which stops before."""
     early: int = 60
     """Iterations that the other experiments make do with."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False

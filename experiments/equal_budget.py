@@ -80,7 +80,7 @@ class Config:
     """Decoder calls after which shapes are scored; the last is what every search may spend."""
     searches: tuple[str, ...] = tuple(DRAWN)
     """Those to compare, CMA-ES among them."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False

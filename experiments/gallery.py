@@ -59,7 +59,7 @@ class Config:
     """Number of frames at which the gain decides which chairs are shown."""
     iterations: int = 60
     """Of CMA-ES (paper: 350)."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False

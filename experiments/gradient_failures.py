@@ -81,7 +81,7 @@ class Config:
     """Chairs to choose from where iou_by_frames.py has not been run."""
     short: int = 60
     """Iterations of the searches on the candidates."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False

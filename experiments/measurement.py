@@ -71,7 +71,7 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 60
     """Of the search."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     name: str = "measurement"

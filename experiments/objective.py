@@ -106,7 +106,7 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 48
     """Of Adam."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False

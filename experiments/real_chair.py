@@ -111,7 +111,7 @@ def run(config: Config, recording: Recording) -> tuple[Journal, dict[str, Rebuil
 
     Nothing is rebuilt where the results of these settings are there, with all pictures.
     """
-    prior, box = load_prior(), read_box(config.box)
+    prior, box = load_prior("chair-autoencoder"), read_box(config.box)
     search = RefineConfig(iterations=config.iterations, symmetry=False)
     mapping = MappingConfig(fusion="points", keyframe_iterations=config.keyframe_iterations)
     mapper = build_mapper(

@@ -80,7 +80,11 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> tuple[dict[str, Any], dict[str, list[Panel]]]:
     """Rebuild the object each way; figures, and pictures of the meshes."""
-    sequence, box, prior = open_sequence(config.recording), read_box(config.box), load_prior()
+    sequence, box, prior = (
+        open_sequence(config.recording),
+        read_box(config.box),
+        load_prior("chair-autoencoder"),
+    )
     search = RefineConfig(iterations=config.iterations, symmetry=False)
     iterations = 2 if config.smoke else MappingConfig.keyframe_iterations
     mapping = MappingConfig(fusion="points", keyframe_iterations=iterations)

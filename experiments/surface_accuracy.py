@@ -61,7 +61,7 @@ class Config:
     """Take every n-th seat."""
     frames: tuple[int, ...] = (4, 18)
     """Numbers of frames that are fused."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False

@@ -149,7 +149,10 @@ def _run_seat(source: meshes.MeshSource, config: Config) -> dict[str, Any]:
 
 @cache
 def _search(iterations: int):
-    prior, search = load_prior(), RefineConfig(iterations=iterations, symmetry=False)
+    prior, search = (
+        load_prior("chair-autoencoder"),
+        RefineConfig(iterations=iterations, symmetry=False),
+    )
     return prior, refiner_for("gradient:adam", prior, search), search
 
 

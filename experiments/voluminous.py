@@ -72,7 +72,7 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 60
     """Of every search (paper: 350)."""
-    weights: Path | None = None
+    weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; those of the package by default."""
     results: Path = RESULTS
     smoke: bool = False

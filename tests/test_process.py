@@ -100,6 +100,24 @@ def test_where_the_system_tells_nothing_the_processor_has_a_name_and_no_features
     assert name and features == set()
 
 
+@pytest.mark.parametrize("batch, cores, devices", [(32, 2, 2), (32, 6, 4), (7, 4, 1), (6, 16, 6)])
+def test_training_counts_cores_that_divide_a_batch(monkeypatch, batch, cores, devices):
+    monkeypatch.setattr(sys, "modules", {})
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
+    process.spread_over_cores(batch)
+    assert os.environ["JAX_NUM_CPU_DEVICES"] == str(devices)
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")
+    process.spread_over_cores(batch)
+    assert os.environ["JAX_NUM_CPU_DEVICES"] == "1"
+
+
+def test_once_jax_is_there_nothing_is_set(monkeypatch):
+    monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
+    process.spread_over_cores(32)
+    assert "JAX_NUM_CPU_DEVICES" not in os.environ
+
+
 def test_the_settings_of_a_process_are_made_without_jax():
     code = "import sys, jaxshape.process; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

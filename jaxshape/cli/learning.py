@@ -18,6 +18,7 @@ from jaxshape.cli.scoring import load_models, score
 from jaxshape.data.config import DatasetConfig
 from jaxshape.files import write_json, write_text
 from jaxshape.model.config import TrainConfig
+from jaxshape.process import spread_over_cores
 from jaxshape.search.config import RefineConfig
 
 OWN_MESHES = DatasetConfig(paths=4)
@@ -134,6 +135,8 @@ class Train:
     machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
 
     def run(self) -> None:
+        if not self.machines.asked:
+            spread_over_cores(self.config.batch)
         from jaxshape.data.dataset import open_dataset
         from jaxshape.model.weights import load_prior
 

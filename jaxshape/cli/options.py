@@ -74,12 +74,18 @@ class Machines:
     process: int | None = None
     """With --coordinator: number of this process, from 0."""
 
+    @property
+    def asked(self) -> bool:
+        """Whether several processes were asked for."""
+        given = (self.coordinator, self.processes, self.process)
+        return self.distributed or given != (None, None, None)
+
     def join(self) -> None:
         """Join the others, if there are any; to be called before JAX computes."""
         count, index = self.processes, self.process
         if count is not None and index is not None:
             require(0 <= index < count, f"--process is {index} of {count}; they count from 0.")
-        if self.distributed or (self.coordinator, count, index) != (None, None, None):
+        if self.asked:
             process.join_processes(self.coordinator, count, index)
 
 

@@ -25,14 +25,15 @@ class Rebuild:
     """Options of all commands that rebuild one object."""
 
     method: Annotated[
-        str,
+        str | None,
         tyro.conf.arg(
             metavar="METHOD",
-            help="How the first code is searched on: encoder (not at all), "
+            help="How the first code is searched on; None for cma, or for no search with a network "
+            "that is conditioned on what was measured: encoder (no search), "
             f"{', '.join(families())}, a variant ({VARIANTS}), or a function of yours by its "
             "import path, package.module:function.",
         ),
-    ] = "cma"
+    ] = None
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
@@ -45,13 +46,19 @@ class Rebuild:
         from jaxshape.search.reconstruction import refiner_for
 
         prior = load_prior(self.weights)
-        return prior, refiner_for(self.method, prior, self.search), self.search
+        return prior, refiner_for(self.method_for(prior), prior, self.search), self.search
 
-    def settings(self, fusion: FusionName) -> dict[str, Any]:
+    def method_for(self, prior: Any) -> str:
+        """The method that was asked for, or the usual one of the prior."""
+        from jaxshape.search.reconstruction import usual_method
+
+        return self.method or usual_method(prior)
+
+    def settings(self, prior: Any, fusion: FusionName) -> dict[str, Any]:
         """Settings of the search for result.json, of grids that are fused in this way."""
         objective = self.search.objective or objective_for(fusion)
         search = asdict(self.search) | {"objective": objective}
-        return {"method": self.method, "seed": self.seed, "search": search}
+        return {"method": self.method_for(prior), "seed": self.seed, "search": search}
 
 
 def report_objective(result: dict[str, Any]) -> None:
@@ -107,7 +114,7 @@ class Demo(Rebuild):
             found = jax.block_until_ready(run(key, prior, batch.occupied, batch.occluded))
         figures = {"object": f"procedural chair {TEST_SEEDS + self.seed}", "frames": self.frames}
         figures |= {"camera": seen.camera, "noise": seen.is_noisy, "fusion": seen.fused_by}
-        figures |= self.settings(seen.fused_by)
+        figures |= self.settings(prior, seen.fused_by)
         figures |= {"seconds": round(time.perf_counter() - start, 2)}
         with console.status("drawing"):
             result = write_result(self.output, observation, found, figures)

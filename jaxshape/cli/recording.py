@@ -87,7 +87,10 @@ class Reconstruct(Rebuild):
         box = read_box(self.box) if self.box else None
         use_poses = self._use_poses(sequence)
         mapper = build_mapper(prior, refiner, search, self.mapping, self.tracking, seed=self.seed)
-        figures: dict[str, Any] = {"object": str(self.frames), **self.settings(self.mapping.fusion)}
+        figures: dict[str, Any] = {
+            "object": str(self.frames),
+            **self.settings(prior, self.mapping.fusion),
+        }
         figures |= {"mapping": asdict(self.mapping), "tracking": asdict(self.tracking)}
         settings = figures | {
             "box": None if box is None else [x.tolist() for x in box],

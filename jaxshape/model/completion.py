@@ -257,5 +257,5 @@ def shapes(params: PyTree) -> PyTree:
     return jax.eval_shape(partial(initialize, architecture=architecture), jax.random.key(0))
 
 
-COMPLETION = ShapeModel("completion", encode, decode, prepare, shapes)
+COMPLETION = ShapeModel("completion", encode, decode, prepare, shapes, conditional=True)
 """Conditional network whose decoder takes what was measured."""

@@ -109,6 +109,8 @@ class TrainConfig:
         code_weight: Weight of what a code costs, 0 or more: of the KL divergence of the conditional
             network's codes, and of half the squared length, in nats, of an auto-encoder's, which
             with noise of 1 is the divergence of a posterior of variance 1.
+        posterior_share: Share of each batch for which the conditional network decodes a code of the
+            posterior, from 0 to 1; the others decode its first code. At 0 codes mean nothing.
         bfloat16: Compute convolutions in bfloat16; parameters, statistics and Adam stay in float32.
         validation: How many of the dataset's last objects are kept out of training and completed
             for each report, 0 or more; at most a tenth of them.
@@ -132,6 +134,7 @@ class TrainConfig:
     occluded_weight: float = 2.0
     code_noise: float = 0.0
     code_weight: float = 1.0
+    posterior_share: float = 0.5
     bfloat16: bool = False
     validation: int = 128
     report_every: int = 100
@@ -143,6 +146,7 @@ class TrainConfig:
         for name in ("steps", "batch", "report_every"):
             checks.whole(name, getattr(self, name), 1)
         checks.within("average", self.average, 0, 1)
+        checks.within("posterior_share", self.posterior_share, 0, 1)
         checks.whole("validation", self.validation, 0)
         for name in ("learning_rate", "occupied_weight", "occluded_weight"):
             checks.positive(name, getattr(self, name))

@@ -119,14 +119,16 @@ AUTOENCODERS = Family(
 def completion_cost(variables, batch: Batch, noise, config: TrainConfig, axis) -> Cost:
     """The evidence bound of a conditional variational auto-encoder.
 
-    Every second example decodes the first code, 0, which must be the best answer without a search;
-    the others a code of the posterior, whose divergence from the normal distribution it pays.
+    Some examples decode the first code, 0, which must be the best answer without a search; the
+    others a code of the posterior, whose divergence from the normal distribution they pay.
     """
     del axis  # no statistics over the batch
     dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32
     params = variables["params"]
     mean, log_variance = completion.posterior(params, batch.grids, batch.surface, dtype)
-    searched = (jnp.arange(len(mean)) % 2 == 1)[:, None]
+    place = jnp.arange(len(mean))
+    share = config.posterior_share
+    searched = (jnp.floor((place + 1) * share) > jnp.floor(place * share))[:, None]
     code = jnp.where(searched, mean + jnp.exp(log_variance / 2) * noise, 0.0)
     found = completion.skips(params, batch.grids, dtype)
     logits = completion.decode_skips(params, found, code)

@@ -64,6 +64,8 @@ class ShapeModel:
         shapes: `params -> ` the same tree of `jax.ShapeDtypeStruct`, for a model of the sizes that
             the parameters seem to have; loading compares weights files with it. None compares only
             the results of `encode` and `decode`.
+        conditional: Whether `prepare` needs the grids: the decoder takes what was measured, so that
+            its first code answers for it already.
     """
 
     kind: str
@@ -71,6 +73,7 @@ class ShapeModel:
     decode: Callable[[Prepared, Float[Array, "n d"]], Float[Array, "n x y z"]]
     prepare: Callable[[PyTree, Grids | None, Precision], Prepared] = share_all
     shapes: Callable[[PyTree], PyTree] | None = None
+    conditional: bool = False
 
 
 class ShapePrior(NamedTuple):

@@ -26,6 +26,10 @@ FORMAT = "jaxshape-shape-prior-1"
 MODELS = {model.kind: model for model in (AUTOENCODER, COMPLETION, PCA)}
 """The kinds of shape models that come with the package."""
 
+PACKAGED = ("chair", "chair-autoencoder")
+"""Weights that come with the package: of the network that is conditioned on what was measured, and
+of the paper's auto-encoder."""
+
 
 class WeightsError(ValueError):
     """A weights file is missing, damaged, or of another model."""
@@ -60,7 +64,8 @@ def load_prior(
     """Read a shape prior; without a path, the one for chairs that comes with the package. [host]
 
     Args:
-        path: A file written by `save_prior` or `jaxshape train`; None for the package's chairs.
+        path: A file written by `save_prior` or `jaxshape train`, or a name of the package's weights
+            (`PACKAGED`): "chair", which is also what None stands for, or "chair-autoencoder".
         model: Your own model, for weights of its kind; None for weights of the package's models.
 
     Raises:
@@ -91,7 +96,7 @@ def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
     """Read the model card of a weights file: data, command, seed, time, measured figures. [host]
 
     Args:
-        path: A weights file; None for the package's chairs.
+        path: A weights file, or a name of the package's weights; None for "chair".
     """
     return json.loads(_read(_path(path))[1]["card"])
 
@@ -124,8 +129,10 @@ def unflatten(named: dict[str, Any]) -> PyTree:
 
 
 def _path(path: str | os.PathLike[str] | None) -> Path:
-    packaged = resources.files("jaxshape.model") / "chair.safetensors"
-    return Path(str(packaged) if path is None else path)
+    name = "chair" if path is None else os.fspath(path)
+    if name in PACKAGED:
+        return Path(str(resources.files("jaxshape.model") / f"{name}.safetensors"))
+    return Path(name)
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

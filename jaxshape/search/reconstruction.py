@@ -81,6 +81,19 @@ def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner
     return build_refiner(method, prior.code_size, config)
 
 
+def usual_method(prior: ShapePrior) -> str:
+    """The search that serves a prior best where none is asked for.
+
+    Args:
+        prior: The shape prior.
+
+    Returns:
+        "encoder", no search, for a conditional model: its decoder knows what was measured, and the
+        codes that explain it better were no better in what was hidden. "cma" for others.
+    """
+    return "encoder" if prior.model.conditional else "cma"
+
+
 def search_space(prior: ShapePrior, config: RefineConfig) -> LatentSpace:
     """The coordinates in which codes are searched, which `config.space` names."""
     return {"whitened": whitened, "raw": raw}[config.space](prior, config.bound)

@@ -126,6 +126,21 @@ def test_the_cost_is_the_evidence_bound():
     np.testing.assert_allclose(cost.loss, expected, rtol=1e-3)
 
 
+@pytest.mark.parametrize("share, searched", [(0.0, 0), (0.25, 1), (0.5, 2), (1.0, 4)])
+def test_a_share_of_the_batch_decodes_posterior_codes(share, searched):
+    """Only they depend on the noise."""
+    variables = COMPLETIONS.initialize(jax.random.key(0), SMALL)
+    grids = grids_of(4)
+    batch = Batch(*(x.astype(jnp.float32) for x in grids[:2]), grids.occupied)
+    config = TrainConfig(SMALL, posterior_share=share)
+
+    def loss_by_example(noise):
+        return completion_cost(variables, batch, noise, config, None).loss
+
+    slope = jax.grad(loss_by_example)(jnp.ones((4, SMALL.code)))
+    assert int((jnp.abs(slope).max(axis=1) > 0).sum()) == searched
+
+
 def test_weights_of_voxels_count():
     variables = COMPLETIONS.initialize(jax.random.key(0), SMALL)
     grids = grids_of(2)

@@ -26,7 +26,7 @@ CHAIRS = 4
 
 @pytest.fixture(scope="module")
 def prior():
-    return load_prior()
+    return load_prior("chair-autoencoder")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def observed():
 
 def test_they_have_the_default_architecture_and_a_card(prior):
     assert architecture_of(prior.params) == Architecture()
-    assert load_card()["licence"] == "Apache-2.0"
+    assert load_card("chair-autoencoder")["licence"] == "Apache-2.0"
 
 
 def test_codes_of_chairs_lie_where_the_stored_statistics_say(prior, observed):

@@ -185,7 +185,7 @@ def test_the_earlier_box_and_the_best_of_each_direction_come_first():
 
 @pytest.fixture(scope="module")
 def prior():
-    return load_prior()
+    return load_prior("chair-autoencoder")
 
 
 @pytest.fixture(scope="module")
