@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from jaxshape.geometry.grids import Grids
+from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.config import Completion
 from jaxshape.model.shapes import Precision, Prepared, ShapeModel
 from jaxshape.model.stencil import convolve, multiply
@@ -223,19 +223,32 @@ def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
 
 
 def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
-    """Features of each object's measurement; those of an unseen object without one."""
+    """Features of each object's measurement and of its mirror image.
+
+    Without a measurement, those of an object of which nothing is known.
+    """
     if grids is None:
         n = architecture_of(params).resolution
         grids = Grids(jnp.zeros((1, n, n, n)), jnp.ones((1, n, n, n)))
     dtype = jnp.bfloat16 if precision == "bfloat16" else jnp.float32
-    found = skips(params, grids)
-    shared = {"decoder": params["decoder"]}
-    return Prepared(shared, jax.tree.map(lambda x: x.astype(dtype), found))
+    sides = [skips(params, Grids(*side)) for side in (grids[:2], map(_mirrored, grids[:2]))]
+    own = jax.tree.map(lambda x: x.astype(dtype), sides)
+    return Prepared({"decoder": params["decoder"]}, own)
 
 
 def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y z"]:
-    """Logits of codes, each with the features of its object."""
-    return decode_skips(prepared.shared, prepared.own, code)
+    """Logits of codes, each with the features of its object.
+
+    They are the mean of two answers, of the object as it is and mirrored: the mirror image of a
+    measurement then gets the mirror image of the answer.
+    """
+    here, there = (decode_skips(prepared.shared, side, code) for side in prepared.own)
+    return (here + _mirrored(there)) / 2
+
+
+def _mirrored(grid: Grid) -> Grid:
+    """Left and right exchanged."""
+    return jnp.flip(grid, axis=-3)
 
 
 def architecture_of(params: PyTree) -> Completion:

@@ -8,7 +8,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.geometry.evidence import from_grids
 from jaxshape.geometry.grids import Grid, Grids
-from jaxshape.geometry.symmetry import mirrored, symmetrised
+from jaxshape.geometry.symmetry import NATS, mirrored, symmetrised
+
+LEARNT_NATS = 1.0
+"""What a seen mirror image adds where the decoder has taken it into account already."""
 
 
 class Composition(NamedTuple):
@@ -28,7 +31,13 @@ class Composition(NamedTuple):
     agreement: Float[Array, "*batch"] | None
 
 
-def complete(grids: Grids, logits: Float[Array, "*batch x y z"], *, symmetry: bool) -> Composition:
+def complete(
+    grids: Grids,
+    logits: Float[Array, "*batch x y z"],
+    *,
+    symmetry: bool,
+    conditional: bool = False,
+) -> Composition:
     """Fill what was not measured with a decoded shape, and with the mirror image of what was.
 
     Args:
@@ -36,13 +45,22 @@ def complete(grids: Grids, logits: Float[Array, "*batch x y z"], *, symmetry: bo
         logits: Logits of their decoded shapes `[*batch x y z]`.
         symmetry: Average each decoded shape with its mirror image, and add what the other side
             showed, where the measured halves agree.
+        conditional: The decoder took the measurement (`ShapeModel.conditional`). Its answer then
+            counts in free space too, where a coarse camera misses thin parts, and is mirrored in
+            occluded voxels alone.
     """
-    symmetric = agreement = None
+    seen, symmetric, agreement = from_grids(grids), None, None
     if symmetry:
-        other = mirrored(from_grids(grids))
-        logits = symmetrised(logits, other)
+        other = mirrored(seen, LEARNT_NATS if conditional else NATS)
+        mean = symmetrised(logits, other)
+        unknown = jnp.asarray(grids.occluded).astype(logits.dtype)
+        logits = unknown * mean + (1 - unknown) * logits if conditional else mean
         symmetric, agreement = other.symmetric, other.agreement
-    composed = compose(grids.occupied, grids.occluded, jax.nn.sigmoid(logits))
+    probability = jax.nn.sigmoid(logits)
+    if conditional:
+        composed = seen.surface + (1 - seen.surface) * probability > 0.5
+    else:
+        composed = compose(grids.occupied, grids.occluded, probability)
     return Composition(composed, logits, symmetric, agreement)
 
 

@@ -189,7 +189,8 @@ def reconstruct(
             precision=config.precision,
         )
         code, logits, objective = found.code, found.logits, score(found.logits, targets)
-    filled = complete(grids, logits, symmetry=config.symmetry)
+    conditional = prior.model.conditional
+    filled = complete(grids, logits, symmetry=config.symmetry, conditional=conditional)
     return Reconstruction(
         first_code=first_code,
         code=code,

@@ -78,6 +78,13 @@ def test_without_a_measurement_nothing_is_known(prior):
     )
 
 
+def test_a_mirrored_measurement_gets_the_mirrored_answer(prior):
+    grids, code = grids_of(2), jax.random.normal(jax.random.key(1), (2, SMALL.code))
+    mirrored = Grids(*(jnp.flip(x, axis=1) for x in grids[:2]))
+    expected = jnp.flip(decode(prior, code, grids), axis=1)
+    np.testing.assert_allclose(decode(prior, code, mirrored), expected, atol=1e-5)
+
+
 def test_half_precision_is_close(prior):
     grids, code = grids_of(2), jax.random.normal(jax.random.key(1), (2, SMALL.code))
     half = decode_prepared(COMPLETION, COMPLETION.prepare(prior.params, grids, "bfloat16"), code)

@@ -72,6 +72,20 @@ def test_without_symmetry_the_decoded_shape_fills_what_is_hidden():
     np.testing.assert_array_equal(found.composed, compose(*grids[:2], LOGITS > 0))
 
 
+def test_a_decoder_that_knew_the_measurement_decides_on_free_space_but_not_on_surface():
+    grids = batch(half_seen(), half_seen(symmetric=False))
+    found = complete(grids, LOGITS, symmetry=True, conditional=True)
+    surface = np.asarray(grids.occupied)
+    free = ~surface & ~np.asarray(grids.occluded)
+    composed, decoded = np.asarray(found.composed), np.asarray(LOGITS > 0)
+    assert composed[surface].all()
+    np.testing.assert_array_equal(composed[free], decoded[free])
+    np.testing.assert_array_equal(np.asarray(found.logits)[~np.asarray(grids.occluded)],
+                                  np.asarray(LOGITS)[~np.asarray(grids.occluded)])  # fmt: skip
+    assert np.any(found.logits[0] != LOGITS[0])
+    np.testing.assert_array_equal(found.logits[1], LOGITS[1])
+
+
 def test_objects_of_a_batch_are_independent():
     grids = batch(half_seen(), half_seen(symmetric=False))
     both = complete(grids, LOGITS, symmetry=True)
