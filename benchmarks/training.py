@@ -1,13 +1,16 @@
 """One training step of 32 pairs, against the same network in PyTorch."""
 
+from dataclasses import replace
 from functools import partial
 
+import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import problems
 from benchmarks.harness import Metric, alternate, compiled, difference, fastest, optional, speedup
 from benchmarks.problems import PRECISIONS
-from jaxshape.model.config import Precision, TrainConfig
+from jaxshape.model.config import PRESETS, Precision
+from jaxshape.model.families import Batch
 from jaxshape.model.training import initial_state, train_step
 
 BATCH = 32
@@ -15,19 +18,28 @@ LIMITS = {"float32": 1e-5, "bfloat16": 3e-3}
 """Differences of the loss, in nats per voxel, that rounding explains."""
 
 
+def _step(state, measured, surface, config):
+    pairs = Batch(measured.astype(jnp.float32), jnp.zeros(measured.shape), surface)
+    return train_step(state, pairs, config)
+
+
 def run(quick: bool) -> list[Metric]:
     return [m for p in PRECISIONS for m in _compare(p, budget=4.0 if quick else 40.0)]
 
 
 def _compare(precision: Precision, budget: float) -> list[Metric]:
-    config = TrainConfig(
-        batch=BATCH, optimizer="adam", occupied_weight=1.0, bfloat16=precision == "bfloat16"
+    config = replace(
+        PRESETS["autoencoder"],
+        batch=BATCH,
+        optimizer="adam",
+        occupied_weight=1.0,
+        bfloat16=precision == "bfloat16",
     )
     problem = problems.chairs(4)
     batch = [
         np.tile(np.array(x), (BATCH // 4, 1, 1, 1)) for x in (problem.occupied, problem.surface)
     ]
-    step = partial(train_step, config=config)
+    step = partial(_step, config=config)
     state = initial_state(config)._replace(variables=problem.prior.params)
     ours, compile_seconds = compiled(step, state, *batch)
     functions = {"jaxshape": partial(ours, state, *batch)}
