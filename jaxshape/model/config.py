@@ -111,9 +111,9 @@ class TrainConfig:
             with noise of 1 is the divergence of a posterior of variance 1.
         posterior_share: Share of each batch for which the conditional network decodes a code of the
             posterior, from 0 to 1; the others decode its first code. At 0 codes mean nothing.
-        bfloat16: Compute convolutions in bfloat16, which trains the conditional network 3 to 4 times
-            as fast where the processor has matrix units for it; parameters, statistics and the
-            optimiser stay in float32.
+        bfloat16: Compute convolutions in bfloat16: the conditional network is then trained 3 to 4
+            times as fast where the processor has matrix units for it. Parameters, statistics and
+            the optimiser stay in float32.
         validation: How many of the dataset's last objects are kept out of training and completed
             for each report, 0 or more; at most a tenth of them.
         report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
