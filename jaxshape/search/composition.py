@@ -46,8 +46,7 @@ def complete(
         symmetry: Average each decoded shape with its mirror image, and add what the other side
             showed, where the measured halves agree.
         conditional: The decoder took the measurement (`ShapeModel.conditional`). Its answer then
-            counts in free space too, where a coarse camera misses thin parts, and is mirrored in
-            occluded voxels alone.
+            counts where something was measured, too, and is mirrored in occluded voxels alone.
     """
     seen, symmetric, agreement = from_grids(grids), None, None
     if symmetry:
@@ -57,11 +56,29 @@ def complete(
         logits = unknown * mean + (1 - unknown) * logits if conditional else mean
         symmetric, agreement = other.symmetric, other.agreement
     probability = jax.nn.sigmoid(logits)
-    if conditional:
-        composed = seen.surface + (1 - seen.surface) * probability > 0.5
-    else:
-        composed = compose(grids.occupied, grids.occluded, probability)
+    keep = agreed if conditional else compose
+    composed = keep(grids.occupied, grids.occluded, probability)
     return Composition(composed, logits, symmetric, agreement)
+
+
+def agreed(
+    occupied: Grid, occluded: Grid, probability: Float[Array, "*batch x y z"]
+) -> Bool[Array, "*batch x y z"]:
+    """What measurement and a decoder that knew of it say together.
+
+    Points of a coarse camera make its rays pass through thin parts: of binary grids surface is kept
+    as it was measured, and free space is left to the decoder. Soft grids say how sure they are of
+    both: they count as much as the decoder.
+
+    Args:
+        occupied: F `[*batch x y z]`, binary or soft.
+        occluded: M `[*batch x y z]`, of the same kind.
+        probability: The decoder's probability of being occupied `[*batch x y z]`.
+    """
+    if jnp.asarray(occupied).dtype == bool:
+        return jnp.asarray(occupied & ~occluded | (probability > 0.5))
+    F, M = jnp.asarray(occupied), jnp.asarray(occluded)
+    return (probability + (1 - M) * F + M * probability) / 2 > 0.5
 
 
 def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*batch x y z"]:

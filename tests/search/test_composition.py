@@ -7,7 +7,7 @@ import pytest
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.symmetry import mirror
-from jaxshape.search.composition import complete, compose
+from jaxshape.search.composition import agreed, complete, compose
 
 KEY = jax.random.key(0)
 LOGITS = jax.random.normal(KEY, (2, 16, 16, 16))
@@ -84,6 +84,13 @@ def test_a_decoder_that_knew_the_measurement_decides_on_free_space_but_not_on_su
                                   np.asarray(LOGITS)[~np.asarray(grids.occluded)])  # fmt: skip
     assert np.any(found.logits[0] != LOGITS[0])
     np.testing.assert_array_equal(found.logits[1], LOGITS[1])
+
+
+def test_soft_grids_count_as_much_as_a_decoder_that_knew_them():
+    F = jnp.array([0.9, 0.9, 0.1, 0.1, 0.9, 0.1]).reshape(1, 1, 6)
+    M = jnp.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0]).reshape(1, 1, 6)
+    p = jnp.array([0.2, 0.05, 0.95, 0.8, 0.4, 0.6]).reshape(1, 1, 6)
+    np.testing.assert_array_equal(agreed(F, M, p).ravel(), [True, False, True, False, False, True])
 
 
 def test_objects_of_a_batch_are_independent():
