@@ -14,6 +14,7 @@ from jaxshape.geometry import camera, fusion
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.autoencoder import architecture_of
+from jaxshape.model.completion import COMPLETION
 from jaxshape.model.config import Architecture
 from jaxshape.model.shapes import decode, encode
 from jaxshape.model.weights import load_card, load_prior
@@ -69,6 +70,56 @@ def test_the_search_brings_shapes_nearer_to_the_truth(observed, rebuilt):
     assert refined > first
     assert composed > first
     assert np.all(np.asarray(rebuilt.objective) < np.asarray(rebuilt.first_objective))
+
+
+# ------------------------------------------------------------------ the conditional network
+
+
+@pytest.fixture(scope="module")
+def chair():
+    return load_prior()
+
+
+def test_the_default_is_the_network_that_knows_the_measurement(chair):
+    assert chair.model == COMPLETION and chair.resolution == 32
+    assert load_card()["licence"] == "Apache-2.0"
+    np.testing.assert_array_equal(chair.code_mean, np.zeros(chair.code_size))
+    np.testing.assert_array_equal(chair.code_covariance, np.eye(chair.code_size))
+
+
+@pytest.fixture(scope="module")
+def completed(chair, observed):
+    config = RefineConfig()
+    return jax.jit(partial(reconstruct, refiner=None, config=config))(
+        jax.random.key(0), chair, *observed[:2]
+    )
+
+
+def test_it_fills_what_is_hidden_better_than_the_auto_encoder(observed, rebuilt, completed):
+    F, M, surface = observed
+
+    def hidden(shapes):
+        return float(jnp.mean(iou(shapes & M, surface & M)))
+
+    assert hidden(completed.fill_logits > 0) > 0.5
+    assert hidden(completed.fill_logits > 0) > hidden(rebuilt.fill_logits > 0) + 0.05
+    composed, measured = (float(jnp.mean(iou(x, surface))) for x in (completed.composed, F))
+    assert composed > 0.7 and composed > measured + 0.05
+    assert composed > float(jnp.mean(iou(rebuilt.composed, surface)))
+
+
+def test_its_codes_move_what_is_hidden_and_little_else(chair, observed):
+    F, M, _ = observed
+    grids = Grids(F[:1], M[:1])
+    codes = jax.random.normal(jax.random.key(0), (1, 8, chair.code_size))
+    shapes = np.asarray(jax.nn.sigmoid(jax.jit(partial(decode, chair))(codes, grids)))[0]
+    spread = shapes.std(axis=0)
+    hidden = np.asarray(M[0])
+    assert spread[hidden].mean() > 2 * spread[~hidden].mean()
+    assert spread[hidden].max() > 0.1
+
+
+# ------------------------------------------------------------------ stored values
 
 
 def test_they_decode_to_stored_values(prior):
