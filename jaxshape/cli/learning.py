@@ -203,6 +203,7 @@ class Train:
         from jaxshape.model.weights import load_prior, save_prior
         from jaxshape.report.card import describe
         from jaxshape.results.evaluation import EvaluateConfig
+        from jaxshape.search.reconstruction import usual_method
 
         card = self.card(output, about)
         weights = output / f"{self.name}.safetensors"
@@ -211,7 +212,7 @@ class Train:
         scores = None
         if held_out:
             config = EvaluateConfig(
-                methods=("encoder", "cma"),
+                methods=tuple(dict.fromkeys(("encoder", usual_method(prior)))),
                 refine=RefineConfig(iterations=50),
                 seed=self.config.seed,
             )
