@@ -152,7 +152,7 @@ def _state(
     keyframes: list[Keyframe] = []
     view = None
     for number, index in enumerate(indices):
-        prepared = prepare(sequence[index], sequence.intrinsics)
+        prepared = prepare(sequence[index])
         view = prepared.view
         masked, segmented = (
             jnp.asarray(np.unpackbits(packed, axis=-1, count=view.depth.shape[1]).astype(bool))

@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from jaxshape.data.sequences import Sequence, Trajectory, write_trajectory
+from jaxshape.data.sequences.cameras import intrinsic_numbers
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grids import binary
@@ -90,13 +91,12 @@ def observation_of(state: MapState) -> Observation:
 def color_views(sequence: Sequence, progress: Progress) -> Iterator[ColorView]:
     """The keyframes that have colours, at their present poses, read one after the other."""
     T_object_world = np.linalg.inv(progress.state.place.box.T_world_object)
-    K = sequence.intrinsics
-    intrinsics = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     for log, keyframe in _fused(progress):
         frame = sequence[log.index]
         if frame.color is not None:
             T_world_camera = np.asarray(keyframe.T_world_camera.as_matrix(), np.float64)
-            yield ColorView(frame.color, frame.depth, intrinsics, T_object_world @ T_world_camera)
+            camera = intrinsic_numbers(frame.intrinsics)
+            yield ColorView(frame.color, frame.depth, camera, T_object_world @ T_world_camera)
 
 
 def counts(progress: Progress) -> dict[str, int]:

@@ -32,6 +32,22 @@ class Camera(NamedTuple):
     source: str
 
 
+class Calibration(NamedTuple):
+    """Cameras that a recording's own files give, of images of some size.
+
+    Attributes:
+        matrices: Camera matrix of each frame, or one of all `[n 3 3]`, in pixels, where column j
+            covers u in [j, j + 1).
+        shape: Height and width of the images they are of, in pixels; None for those of the depth
+            images.
+        source: Where the cameras come from.
+    """
+
+    matrices: Float[np.ndarray, "n 3 3"]
+    shape: tuple[int, int] | None
+    source: str
+
+
 class DefaultCamera(NamedTuple):
     """The camera that a kind of recording is known to be made with.
 
@@ -71,6 +87,28 @@ def find_camera(folder: Path, names: Iterable[str], shape: tuple[int, int]) -> C
 
 def _camera(K: Matrix, path: Path, shape: tuple[int, int]) -> Camera:
     return Camera(_checked(K, path, shape), path.name)
+
+
+def scaled_cameras(calibration: Calibration, shape: tuple[int, int]) -> Float[np.ndarray, "n 3 3"]:
+    """The cameras of a calibration, for images of `shape`; `SequenceError` if they are not."""
+    height, width = calibration.shape or shape
+    if not (height > 0 and width > 0 and same_aspect((height, width), shape)):
+        raise SequenceError(
+            f"{calibration.source} is of images of {size((height, width))} pixels, and the depth "
+            f"images are {size(shape)}; expected the camera of the depth images: write theirs to "
+            "cam_K.txt, and remove it."
+        )
+    scaled = np.diag([shape[1] / width, shape[0] / height, 1.0]) @ calibration.matrices
+    return np.stack([_checked(K, calibration.source, shape) for K in scaled])
+
+
+def matrices_of(fx: Any, fy: Any, cx: Any, cy: Any) -> Float[np.ndarray, "n 3 3"]:
+    """Camera matrices from their numbers, each one number or one of each frame."""
+    fx, fy, cx, cy = np.broadcast_arrays(*(np.atleast_1d(one) for one in (fx, fy, cx, cy)))
+    matrices = np.tile(np.eye(3), (len(fx), 1, 1))
+    matrices[:, 0, 0], matrices[:, 1, 1] = fx, fy
+    matrices[:, 0, 2], matrices[:, 1, 2] = cx, cy
+    return matrices
 
 
 def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int]) -> Camera:
@@ -156,7 +194,7 @@ def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
     return np.diag([shape[1] / width, shape[0] / height, 1.0]) @ K
 
 
-def _checked(K: Matrix, path: Path, shape: tuple[int, int]) -> Matrix:
+def _checked(K: Matrix, path: Path | str, shape: tuple[int, int]) -> Matrix:
     """The matrix, if it can be that of images of `shape`, else `SequenceError`."""
     (h, w), (fx, fy, cx, cy) = shape, intrinsic_numbers(K)
     if not (np.isfinite(K).all() and min(fx, fy) > 0 and np.array_equal(K[2], (0, 0, 1))):

@@ -120,12 +120,12 @@ def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
     """A sentence for each colour image or mask, of some, that cannot be used."""
     damaged = []
     for index in _sampled(sequence):
-        _, _, color, mask = sequence.files[index]
+        files = sequence.files[index]
         try:
-            if color is not None:
-                read_color(color, sequence.shape)
-            if mask is not None:
-                read_mask(mask, sequence.shape)
+            if files.color is not None:
+                read_color(files.color, sequence.shape)
+            if files.mask is not None:
+                read_mask(files.mask, sequence.shape)
         except SequenceError as error:
             damaged.append(str(error))
     return tuple(damaged)

@@ -9,13 +9,19 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
-from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
+from jaxshape.data.sequences.frames import (
+    Finding,
+    FrameFiles,
+    SequenceError,
+    usual_depth_scale,
+)
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
     color_images,
     depth_images,
     files_in,
+    has_depth_folder,
     mask_images,
     numbers_in,
     partners,
@@ -38,7 +44,7 @@ PoseReader = Callable[[int], Float[np.ndarray, "4 4"] | None]
 
 
 def fits_redwood(contents: Contents) -> bool:
-    depth = files_in(contents, ("depth",), (".png",)) if "depth" in contents.folders else {}
+    depth = files_in(contents, ("depth",), (".png",))
     return bool(depth) and all(map(_STAMPED.fullmatch, depth))
 
 
@@ -73,7 +79,7 @@ def _stamps(names: dict[str, Path]) -> Float[np.ndarray, " n"]:
 
 
 def fits_bundlesdf(contents: Contents) -> bool:
-    return "depth" in contents.folders and "cam_K.txt" in contents.files
+    return has_depth_folder(contents) and "cam_K.txt" in contents.files
 
 
 def list_bundlesdf(contents: Contents) -> Listed:
@@ -89,7 +95,7 @@ def list_bundlesdf(contents: Contents) -> Listed:
 
 
 def fits_open3d(contents: Contents) -> bool:
-    return "depth" in contents.folders
+    return has_depth_folder(contents)
 
 
 def list_open3d(contents: Contents) -> Listed:
@@ -107,7 +113,7 @@ def _by_name(contents: Contents) -> Listed:
     read = _pose_files(contents, list(depth)) or _trajectory_poses(contents, len(depth))
     return Listed(
         files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
-        depth_scale=MILLIMETRES,
+        depth_scale=usual_depth_scale(depth.values()),
         read_pose=read,
         camera=DefaultCamera(PRIMESENSE, "Open3D's default, a PrimeSense", sure=False),
         findings=_lone_colors(len(offered), color),

@@ -116,3 +116,27 @@ def _between(
     T[:3, :3] = turn(share).as_matrix()
     T[:3, 3] = (1 - share) * T_a[:3, 3] + share * T_b[:3, 3]
     return T
+
+
+def from_opengl(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Poses of cameras with y up and z backwards, as OpenGL, Blender and ARKit have, as ours."""
+    return T * np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def from_quaternions(
+    places: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"], source: object
+) -> Float[np.ndarray, "n 4 4"]:
+    """Poses from places and quaternions x y z w; NaN where they are not finite."""
+    T = np.full((len(places), 4, 4), np.nan)
+    finite = np.isfinite(places).all(axis=1) & np.isfinite(quaternions).all(axis=1)
+    lengths = np.linalg.norm(quaternions, axis=1)
+    if (bad := np.flatnonzero(finite & (np.abs(lengths - 1) > 1e-2))).size:
+        raise SequenceError(
+            f"{source}: pose {bad[0]} has a quaternion of length {lengths[bad[0]]:.3g}; expected "
+            "x y z w of length 1: write it again."
+        )
+    T[finite] = np.eye(4)
+    if finite.any():
+        T[finite, :3, :3] = Rotation.from_quat(quaternions[finite]).as_matrix()
+        T[finite, :3, 3] = places[finite]
+    return T

@@ -116,7 +116,7 @@ def follow(
 
 def _begin(sequence: Sequence, start: Start, mapper: Mapper, use_poses: bool) -> Progress:
     frame = sequence[start.index]
-    prepared = prepare(frame, sequence.intrinsics, start.masked)
+    prepared = prepare(frame, start.masked)
     state, step = mapper.init(
         prepared,
         start.box,
@@ -140,10 +140,10 @@ def _next(
         log = FrameLog(index, name, "unreadable", str(problem), last, None, {})
         return progress._replace(logs=(*logs, log))
     given = frame.T_world_camera if use_poses else None
-    prepared = prepare(frame, sequence.intrinsics)
+    prepared = prepare(frame)
     # A mask, or a box that was given, says what is the object; one that was found is not sure.
     is_estimated = progress.start.T_level_world is not None and frame.mask is None
-    cut = partial(_cut, frame, sequence, state.keyframes) if is_estimated else None
+    cut = partial(_cut, frame, state.keyframes) if is_estimated else None
     state, step = mapper.step(state, prepared, None if given is None else as_pose(given), cut)
     relative = None
     if step.T_world_camera is not None:
@@ -162,12 +162,12 @@ def _next(
 
 
 def _cut(
-    frame: Frame, sequence: Sequence, keyframes: tuple[Keyframe, ...], box: Box, T: jaxlie.SE3
+    frame: Frame, keyframes: tuple[Keyframe, ...], box: Box, T: jaxlie.SE3
 ) -> Bool[Array, "_ _"]:
     """The clusters of a frame that lie mostly in the object's box and are nothing seen before."""
     others = np.concatenate([_others(one, box) for one in keyframes[:1] + keyframes[1:][-8:]])
     T_world_camera = np.asarray(T.as_matrix(), np.float64)
-    found = segment_inside(frame.depth, sequence.intrinsics, box, T_world_camera, others)
+    found = segment_inside(frame.depth, frame.intrinsics, box, T_world_camera, others)
     return resized(found, keyframes[0].depth.shape)
 
 

@@ -116,7 +116,7 @@ def find_start(
         if use_pose and frame.T_world_camera is None:
             reasons.append(f"{frame.name}: It has no pose.")
             continue
-        found = segment(frame.depth, frame.color, sequence.intrinsics, prompt, frame.mask)
+        found = segment(frame.depth, frame.color, frame.intrinsics, prompt, frame.mask)
         if found.confidence >= (SURE_OF_PROMPT if _is_prompted(prompt) else SURE):
             return _place_first(sequence, prior, index, frame, found, use_pose)
         reasons.append(f"{frame.name}: {found.reason}")
@@ -160,13 +160,13 @@ def _place_first(
     use_pose: bool,
 ) -> Start:
     T_world_camera = _world_pose(frame, use_pose)
-    floor = _floor(frame, sequence, found)
+    floor = _floor(frame, found)
     up, of_up = _up(floor, T_world_camera, use_pose)
     cut = f"{frame.name}: {found.reason}"
     doubts = [cut] * (found.confidence < SURE) + [of_up] * (floor is None)
     T_level_world = np.eye(4)
     T_level_world[:3, :3] = _rotation_onto_y(up)
-    prepared = prepare(frame, sequence.intrinsics)
+    prepared = prepare(frame)
     start = Start(
         index=index,
         masked=found.segmented,
@@ -197,8 +197,8 @@ def _with_doubt_of_front(start: Start) -> Start:
     return start._replace(notes=(*start.notes, doubt), warnings=(*start.warnings, doubt))
 
 
-def _floor(frame: Frame, sequence: Sequence, found: Segmentation) -> Floor | None:
-    points = camera_points(frame.depth, sequence.intrinsics)
+def _floor(frame: Frame, found: Segmentation) -> Floor | None:
+    points = camera_points(frame.depth, frame.intrinsics)
     known = frame.depth > 0
     planes = dominant_planes(points[known])
     return floor_plane(points[known], planes, points[found.segmented & known])

@@ -191,20 +191,17 @@ view_again = jax.jit(view_of)
 # Frames ------------------------------------------------------------------------------------------
 
 
-def prepare(
-    frame: Frame, K: Float[np.ndarray, "3 3"], masked: Bool[np.ndarray, "h w"] | None = None
-) -> PreparedFrame:
+def prepare(frame: Frame, masked: Bool[np.ndarray, "h w"] | None = None) -> PreparedFrame:
     """A frame at working size, with its oriented points.
 
     Args:
         frame: The frame.
-        K: Camera matrix `[3 3]`, in pixels.
         masked: Pixels that may show the object, in place of its own mask; None for that mask.
     """
     halvings = 0
     while frame.depth.shape[1] >> halvings > WORKING_WIDTH:
         halvings += 1
-    image = DepthImage(jnp.asarray(frame.depth), intrinsics_of(K))
+    image = DepthImage(jnp.asarray(frame.depth), intrinsics_of(frame.intrinsics))
     view = _view(*image, halvings)
     mask = frame.mask if masked is None else masked
     shape = view.depth.shape
