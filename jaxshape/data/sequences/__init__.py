@@ -19,9 +19,6 @@ from typing import NamedTuple
 
 from jaxshape.data.sequences import folders, seven_scenes, tum
 from jaxshape.data.sequences.cameras import Camera, default_camera, find_camera, guessed
-from jaxshape.data.sequences.evidence import PoseAgreement as PoseAgreement
-from jaxshape.data.sequences.evidence import pose_agreement as pose_agreement
-from jaxshape.data.sequences.evidence import poses_look_inverted as poses_look_inverted
 from jaxshape.data.sequences.frames import Finding as Finding
 from jaxshape.data.sequences.frames import Frame as Frame
 from jaxshape.data.sequences.frames import FrameFiles as FrameFiles
@@ -109,6 +106,7 @@ def open_sequence(
         times=listed.times,
         color_delays=listed.color_delays,
         findings=listed.findings + doubts + remarks,
+        camera_is_guess=bool(doubts),
     )
 
 

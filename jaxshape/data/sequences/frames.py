@@ -13,7 +13,7 @@ from PIL import Image
 SATURATED = 65535
 """The value that depth cameras write where they measured nothing sure; read as 0, unknown."""
 
-USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 5000.0, 10000.0)
+USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 """Depth units per metre that people use."""
 
 _PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: what depth cameras reach, with room to spare
@@ -95,6 +95,10 @@ class Sequence:
         color_delays: Seconds from a depth image to its colour image `[n]`, NaN where it has none;
             None without times.
         findings: Remarks made on opening that a user should know.
+        camera_is_guess: Whether the recording holds no camera, and that of such recordings is
+            taken.
+        correct_depth: From a depth image as it is written, in metres, to depth along the optical
+            axis; None where it is written so.
     """
 
     layout: str
@@ -108,6 +112,8 @@ class Sequence:
     times: Float[np.ndarray, " n"] | None = None
     color_delays: Float[np.ndarray, " n"] | None = None
     findings: tuple[Finding, ...] = ()
+    camera_is_guess: bool = False
+    correct_depth: Callable[[Float[np.ndarray, "h w"]], Float[np.ndarray, "h w"]] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -138,7 +144,8 @@ class Sequence:
         Args:
             index: Number of the frame, from 0.
         """
-        return read_depth(self.files[index].depth, self.shape, depth_scale=self.depth_scale)
+        depth = read_depth(self.files[index].depth, self.shape, depth_scale=self.depth_scale)
+        return depth if self.correct_depth is None else self.correct_depth(depth)
 
 
 # Depth -----------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from jaxshape.data.sequences.listing import (
     with_colors_by_time,
 )
 from jaxshape.data.sequences.poses import known, poses_at
+from jaxshape.data.sequences.text import read_text
 from jaxshape.data.sequences.trajectories import read_trajectory
 
 _CALIBRATED = {
@@ -61,7 +62,7 @@ def list_frames(contents: Contents) -> Listed:
 def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
     """Times, rising, and images of lines `time file`."""
     try:
-        words = [line.split(maxsplit=1) for line in path.read_text().splitlines()]
+        words = [line.split(maxsplit=1) for line in read_text(path).splitlines()]
         pairs = sorted((float(w[0]), w[1].strip()) for w in words if w and not w[0].startswith("#"))
     except (OSError, ValueError, IndexError) as error:
         raise SequenceError(
