@@ -167,9 +167,7 @@ def read_as(sequence: Sequence, convention: Convention) -> Sequence:
     return replace(sequence, depth_scale=convention.depth_scale or sequence.depth_scale)
 
 
-def _pose(
-    read: Callable[[int], Pose | None], names: tuple[str, ...], index: int
-) -> Pose | None:
+def _pose(read: Callable[[int], Pose | None], names: tuple[str, ...], index: int) -> Pose | None:
     """A pose in our convention; a matrix stored by columns is put right as a whole."""
     try:
         T = read(index)

@@ -87,11 +87,13 @@ def _first_telling(sequence: Sequence, first: int, read) -> Pair | None:
 
 
 def _depth(sequence: Sequence, index: int) -> Float[np.ndarray, "h w"] | None:
-    """A depth image as it is written, at the depth scale of the recording; None if damaged."""
+    """A depth image at the depth scale of the recording, plausible or not; None if damaged."""
     with suppress(SequenceError):  # whoever uses the frame will hear of it
         raw = read_raw_depth(sequence.files[index].depth, sequence.shape)
         valid = (raw > 0) & (raw < SATURATED)
-        return np.where(valid, raw / sequence.depth_scale, 0) if valid.any() else None
+        depth = np.where(valid, raw / sequence.depth_scale, 0)
+        depth = depth if sequence.correct_depth is None else sequence.correct_depth(depth)
+        return depth if valid.any() else None
     return None
 
 

@@ -35,6 +35,11 @@ class Finding(NamedTuple):
     evidence: str
     advice: str
 
+    @property
+    def sentence(self) -> str:
+        """Both, as sentences."""
+        return f"{self.evidence.rstrip('.')}. {self.advice}"
+
 
 class Frame(NamedTuple):
     """One RGB-D image.
@@ -197,14 +202,18 @@ def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
     return Finding(
         f"the median depth is {_readable_length(median)} at depth scale {depth_scale:g}; expected "
         f"{low:g} to {high:g} m",
-        f"is --depth-scale {likely_depth_scale(median, depth_scale):g} meant?",
+        f"is --depth-scale {likely_depth_scales(median, depth_scale)} meant?",
     )
 
 
-def likely_depth_scale(median: float, depth_scale: float) -> float:
-    """The usual scale at which a median depth becomes that of an object in a room."""
+def likely_depth_scales(median: float, depth_scale: float) -> str:
+    """The usual scales at which a median depth becomes that of an object in a room, in words."""
     usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
-    return min(USUAL_DEPTH_SCALES, key=lambda scale: abs(np.log(scale / usual)))
+    distance = {scale: abs(np.log(scale / usual)) for scale in USUAL_DEPTH_SCALES}
+    nearest = min(distance, key=distance.__getitem__)
+    near = [scale for scale in distance if distance[scale] < np.log(2)] or [nearest]
+    *others, last = (f"{scale:g}" for scale in near)
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _readable_length(metres: float) -> str:

@@ -19,7 +19,7 @@ from jaxshape.data.sequences.evidence import (
 from jaxshape.data.sequences.frames import USUAL_DEPTH_SCALES, Sequence
 
 FITS = 0.7
-"""Agreement from which a convention fits; noise and what stands in the way leave it at .8 to .99."""
+"""Agreement from which a convention fits; noise and what stands in between leave .8 to .99."""
 
 GOOD = 0.9
 """Agreement below which conventions that differ in more than one thing are tried, too."""
@@ -112,7 +112,9 @@ class _Search:
         self.pairs = pairs
         self.seen: dict[tuple[str, ...], tuple[Seen, ...]] = {}
 
-    def share(self, names: tuple[str, ...], longer: float = 1.0, tolerance: float = TOLERANCE) -> float:
+    def share(
+        self, names: tuple[str, ...], longer: float = 1.0, tolerance: float = TOLERANCE
+    ) -> float:
         of_depth = tuple(name for name in names if name in OF_DEPTH)
         if of_depth not in self.seen:
             self.seen[of_depth] = seen_by(self.pairs, self.K, of_depth)

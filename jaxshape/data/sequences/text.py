@@ -1,4 +1,4 @@
-"""Numbers in text files, as people's tools write them: byte order marks, UTF-16, comments, commas."""
+"""Numbers in text files as people write them: byte order marks, UTF-16, comments, commas."""
 
 import codecs
 import re
