@@ -96,7 +96,9 @@ def open_sequence(
     shape = _shape_of(listed)
     camera, doubts = _camera(contents, listed, shape)
     has_poses, is_guess = listed.read_pose is not None, bool(doubts)
-    doubts += tuple(unread(contents, has_poses=has_poses, has_camera=not is_guess))
+    doubts += tuple(
+        unread(contents, has_poses=has_poses, has_camera=not is_guess, told=listed.findings)
+    )
     files, remarks = _without_other_colors(listed, shape)
     return Sequence(
         layout=name,

@@ -191,14 +191,15 @@ def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:
     """Whether the poses fit the depth images, and in which convention they would."""
     if reading is None:
         return
-    compared = f"of the pixels of {reading.pairs} pairs of frames agree"
+    pairs, tolerance = reading.pairs, reading.tolerance
+    compared = f"of the pixels of {pairs} pairs of frames agree to {tolerance:.0%}"
     best, rival = reading.best, reading.rival
     if best is not None:
         meaning, options = best.convention.meaning, best.convention.options
         if reading.by_columns and not reading.pairs:
             evidence = "the last column of the matrices is 0 0 0 1"
         else:
-            evidence = f"{best.share:.0%} {compared} so, {reading.given:.0%} as written"
+            evidence = f"so {best.share:.0%} {compared}, as written {reading.given:.0%}"
         if is_used:
             advice = f"It is read so. {options} states it; --convention {AS_GIVEN} denies it."
         elif rival is None:

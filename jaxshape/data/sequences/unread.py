@@ -18,23 +18,29 @@ _TEXT = (".txt", ".json", ".csv", ".log", ".yaml", ".yml", ".tum", ".bin", ".fre
 _OURS = ("keyframes.json", "result.json")
 
 
-def unread(contents: Contents, *, has_poses: bool, has_camera: bool) -> Iterator[Finding]:
+def unread(
+    contents: Contents, *, has_poses: bool, has_camera: bool, told: tuple[Finding, ...] = ()
+) -> Iterator[Finding]:
     """Remarks on files that lie in a recording for which no use was found.
 
     Args:
         contents: The folder.
         has_poses: Whether the recording was found to have poses; if so, no others are missed.
         has_camera: Whether a camera was found.
+        told: Remarks that were made already; files that they name are left out.
     """
-    if not has_poses and (names := _like(_POSES, contents)):
+    told_of = " ".join(evidence for evidence, _ in told)
+    untold = frozenset(name for name in contents.files if name not in told_of)
+    contents = contents._replace(files=untold)
+    if not has_poses and (found := _like(_POSES, contents)):
         yield Finding(
-            f"no poses are read, though {names} may hold them",
+            f"no poses are read, though {found} may hold them",
             "Poses are read from groundtruth.txt beside depth.txt, poses/N.txt, trajectory.log or "
             "an Open3D trajectory.json: write theirs so, or the camera is tracked.",
         )
-    if not has_camera and (names := _like(_CAMERA, contents)):
+    if not has_camera and (found := _like(_CAMERA, contents)):
         yield Finding(
-            f"no camera is read, though {names} may hold it",
+            f"no camera is read, though {found} may hold it",
             "Write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt in the folder.",
         )
 
