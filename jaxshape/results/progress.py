@@ -24,9 +24,11 @@ from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grids import binary
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.map.state import MapState, grids_of
+from jaxshape.mapping.placement.finding import Start
 from jaxshape.mapping.tracking.keyframes import Keyframe
 from jaxshape.results.coloring import ColorView
 from jaxshape.results.output import Observation, write_shape
+from jaxshape.results.verdict import SeenView
 
 FRAMES_TO_SHOW = 6
 
@@ -57,7 +59,11 @@ def write_progress(
     if observation.field is not None:
         observation = observation._replace(views=color_views(sequence, progress))
     start = progress.start
-    result = {**figures, **counts(progress), "notes": start.notes, "warnings": start.warnings}
+    if not running:
+        keyframes, floor = seen_views(progress.state), floor_height(start)
+        observation = observation._replace(keyframes=keyframes, floor=floor)
+    warnings = [*figures.get("warnings", ()), *start.warnings]
+    result = {**figures, **counts(progress), "notes": start.notes, "warnings": warnings}
     result["box"] = {
         "T_world_object": start.box.T_world_object.tolist(),
         "size": start.box.size.tolist(),
@@ -86,6 +92,26 @@ def observation_of(state: MapState) -> Observation:
         field=state.measurement if isinstance(state.measurement, DistanceField) else None,
         sensor=state.fusing.sensor,
     )
+
+
+def seen_views(state: MapState) -> tuple[SeenView, ...]:
+    """The keyframes of a map, as a mesh in the object frame is compared with them."""
+    T_object_world = np.linalg.inv(state.place.box.T_world_object)
+
+    def seen(one: Keyframe) -> SeenView:
+        fx, fy, cx, cy = map(float, one.intrinsics)
+        T_object_camera = T_object_world @ np.asarray(one.T_world_camera.as_matrix(), np.float64)
+        depth, segmented = np.asarray(one.depth), np.asarray(one.segmented)
+        return SeenView(depth, segmented, (fx, fy, cx, cy), T_object_camera)
+
+    return tuple(map(seen, state.keyframes))
+
+
+def floor_height(start: Start) -> float:
+    """y of the floor in the object frame, which stands upright on it; NaN where it is not known."""
+    if start.T_level_world is None:
+        return np.nan
+    return start.floor - float((start.T_level_world @ start.box.T_world_object)[1, 3])
 
 
 def color_views(sequence: Sequence, progress: Progress) -> Iterator[ColorView]:

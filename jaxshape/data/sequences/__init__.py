@@ -2,10 +2,11 @@
 
 A layout is two functions: whether a folder `fits` it, and one that lists the files of each frame.
 Images are read, and checked, one frame at a time when asked for, so a long sequence never fills the
-memory. Rooms, in the order of data: `frames` (what is read), `poses`, `trajectories`, `cameras`,
-`listing` (which images belong together), `seven_scenes`, `tum`, `folders` (the layouts), `evidence`
-(do the poses fit the images?), `figures` and `inspection` (what to know of a recording, and what to
-doubt).
+memory. Rooms, in the order of data: `frames` (what is read), `text`, `poses`, `trajectories`,
+`cameras`, `listing` (which images belong together), `seven_scenes`, `tum`, `folders` (the layouts),
+`unread` (files without use), `conventions` (how others write poses and depth), `evidence` (do the
+poses fit the images?), `hypotheses` (in which convention do they?), `figures` and `inspection`
+(what to know of a recording, and what to doubt).
 
 Depth images and colour images are taken as registered: of one camera, as all these layouts promise.
 A colour image of another size but the same aspect is scaled to the depth image.
@@ -40,9 +41,6 @@ from jaxshape.data.sequences.cameras import (
     guessed,
     scaled_cameras,
 )
-from jaxshape.data.sequences.evidence import PoseAgreement as PoseAgreement
-from jaxshape.data.sequences.evidence import pose_agreement as pose_agreement
-from jaxshape.data.sequences.evidence import poses_look_inverted as poses_look_inverted
 from jaxshape.data.sequences.frames import Finding as Finding
 from jaxshape.data.sequences.frames import Frame as Frame
 from jaxshape.data.sequences.frames import FrameFiles as FrameFiles
@@ -56,6 +54,7 @@ from jaxshape.data.sequences.trajectories import Pinhole as Pinhole
 from jaxshape.data.sequences.trajectories import Trajectory as Trajectory
 from jaxshape.data.sequences.trajectories import read_trajectory as read_trajectory
 from jaxshape.data.sequences.trajectories import write_trajectory as write_trajectory
+from jaxshape.data.sequences.unread import unread
 
 
 class Layout(NamedTuple):
@@ -128,6 +127,10 @@ def open_sequence(
         raise SequenceError(_nothing_fits(contents))
     shape = _shape_of(listed)
     camera, cameras, doubts = _cameras(contents, listed, shape)
+    has_poses, is_guess = listed.read_pose is not None, bool(doubts)
+    doubts += tuple(
+        unread(contents, has_poses=has_poses, has_camera=not is_guess, told=listed.findings)
+    )
     files, remarks = _without_other_colors(listed, shape)
     return Sequence(
         layout=name,
@@ -135,13 +138,14 @@ def open_sequence(
         camera=camera.source,
         files=files,
         read_pose=listed.read_pose or _no_pose,
-        has_poses=listed.read_pose is not None,
+        has_poses=has_poses,
         shape=shape,
         depth_scale=float(depth_scale or listed.depth_scale),
         times=listed.times,
         color_delays=listed.color_delays,
         findings=listed.findings + doubts + remarks,
         cameras=cameras,
+        camera_is_guess=is_guess,
     )
 
 

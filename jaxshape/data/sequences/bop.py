@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration
+from jaxshape.data.sequences.documents import matrix_of, read_json_object
 from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import (
     COLOR_SUFFIXES,
@@ -19,7 +20,6 @@ from jaxshape.data.sequences.listing import (
     partners,
 )
 from jaxshape.data.sequences.poses import known
-from jaxshape.data.sequences.texts import matrix_of, read_json_object
 
 Instance = tuple[int, int]
 """Number of an object, and which of the objects with this number in an image it is."""

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxshape.data.sequences.frames import Finding, SequenceError, same_aspect, size
 from jaxshape.data.sequences.poses import read_matrix
+from jaxshape.data.sequences.text import read_text, words_of
 
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -155,7 +156,8 @@ def _read_opencv(path: Path) -> Matrix:
 def _read_numbers(path: Path) -> Matrix:
     """The first four numbers of a file, as ETH3D's SLAM benchmark writes them."""
     try:
-        fx, fy, cx, cy = (float(word) for word in path.read_text().split()[:4])
+        words = [word for _, line in words_of(read_text(path)) for word in line]
+        fx, fy, cx, cy = map(float, words[:4])
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} cannot be read as a camera ({error}); expected `fx fy cx cy`: write it again."
@@ -173,7 +175,7 @@ _FILES: dict[str, Callable[[Path], Matrix]] = {
 def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
     """Open3D's PinholeCameraIntrinsic, or the first of a trajectory; None if it is neither."""
     try:
-        content: Any = json.loads(path.read_text())
+        content: Any = json.loads(read_text(path))
         if "parameters" in content:
             content = next(iter(content["parameters"]), {}).get("intrinsic", {})
         if "intrinsic_matrix" not in content:

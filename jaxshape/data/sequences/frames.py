@@ -16,7 +16,7 @@ from jaxshape.data.sequences.rasters import Picture, open_picture
 SATURATED = 65535
 """The value that depth cameras write where they measured nothing sure; read as 0, unknown."""
 
-USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 5000.0, 10000.0)
+USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 """Depth units per metre that people use."""
 
 _PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: what depth cameras reach, with room to spare
@@ -35,6 +35,11 @@ class Finding(NamedTuple):
 
     evidence: str
     advice: str
+
+    @property
+    def sentence(self) -> str:
+        """Both, as sentences."""
+        return f"{self.evidence.rstrip('.')}. {self.advice}"
 
 
 class Frame(NamedTuple):
@@ -103,6 +108,10 @@ class Sequence:
         findings: Remarks made on opening that a user should know.
         cameras: Camera matrix of each depth image `[n 3 3]`, in pixels; None where `intrinsics` is
             that of all.
+        camera_is_guess: Whether the recording holds no camera, and that of such recordings is
+            taken.
+        correct_depth: From a depth image as it is written, in metres, to depth along the optical
+            axis; None where it is written so.
     """
 
     layout: str
@@ -117,6 +126,8 @@ class Sequence:
     color_delays: Float[np.ndarray, " n"] | None = None
     findings: tuple[Finding, ...] = ()
     cameras: Float[np.ndarray, "n 3 3"] | None = None
+    camera_is_guess: bool = False
+    correct_depth: Callable[[Float[np.ndarray, "h w"]], Float[np.ndarray, "h w"]] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -150,9 +161,9 @@ class Sequence:
         """
         files = self.files[index]
         depth = read_depth(files.depth, self.shape, depth_scale=self.depth_scale)
-        if files.confidence is None:
-            return depth
-        return np.where(_read_confident(files.confidence, self.shape), depth, np.float32(0))
+        if files.confidence is not None:
+            depth = np.where(_read_confident(files.confidence, self.shape), depth, np.float32(0))
+        return depth if self.correct_depth is None else self.correct_depth(depth)
 
 
 # Depth -----------------------------------------------------------------------------------------
@@ -222,14 +233,18 @@ def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
     return Finding(
         f"the median depth is {_readable_length(median)} at depth scale {depth_scale:g}; expected "
         f"{low:g} to {high:g} m",
-        f"is --depth-scale {likely_depth_scale(median, depth_scale):g} meant?",
+        f"is --depth-scale {likely_depth_scales(median, depth_scale)} meant?",
     )
 
 
-def likely_depth_scale(median: float, depth_scale: float) -> float:
-    """The usual scale at which a median depth becomes that of an object in a room."""
+def likely_depth_scales(median: float, depth_scale: float) -> str:
+    """The usual scales at which a median depth becomes that of an object in a room, in words."""
     usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
-    return min(USUAL_DEPTH_SCALES, key=lambda scale: abs(np.log(scale / usual)))
+    distance = {scale: abs(np.log(scale / usual)) for scale in USUAL_DEPTH_SCALES}
+    nearest = min(distance, key=distance.__getitem__)
+    near = [scale for scale in distance if distance[scale] < np.log(2)] or [nearest]
+    *others, last = (f"{scale:g}" for scale in near)
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _readable_length(metres: float) -> str:

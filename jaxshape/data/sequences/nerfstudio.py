@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
+from jaxshape.data.sequences.documents import below, matrix_of, read_json_object
 from jaxshape.data.sequences.frames import (
     Finding,
     FrameFiles,
@@ -23,7 +24,6 @@ from jaxshape.data.sequences.listing import (
     partners,
 )
 from jaxshape.data.sequences.poses import from_opengl, known
-from jaxshape.data.sequences.texts import below, matrix_of, read_json_object
 
 _SOURCE = "transforms.json"
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
+from jaxshape.data.sequences.documents import matrix_of, read_json_object
 from jaxshape.data.sequences.frames import FrameFiles, SequenceError, usual_depth_scale
 from jaxshape.data.sequences.listing import (
     Contents,
@@ -21,7 +22,6 @@ from jaxshape.data.sequences.listing import (
     partners,
 )
 from jaxshape.data.sequences.poses import from_opengl, from_quaternions, known
-from jaxshape.data.sequences.texts import matrix_of, read_json_object
 
 _PACKED = (
     "holds depth images that are packed with Apple's LZFSE, which is not read; expected Record3D's "

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
+from jaxshape.data.sequences.documents import matrix_of, read_bounded, read_json_object, rows_of
 from jaxshape.data.sequences.frames import FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import (
     COLOR_SUFFIXES,
@@ -20,7 +21,6 @@ from jaxshape.data.sequences.listing import (
     partners,
 )
 from jaxshape.data.sequences.poses import known
-from jaxshape.data.sequences.texts import matrix_of, read_json_object, read_text, rows_of
 
 _POSES = ("traj.txt", "traj_w_c.txt")
 _SCALE = 6553.5
@@ -42,7 +42,7 @@ def _poses(contents: Contents) -> Path | None:
 
 def _is_matrices(path: Path) -> bool:
     """Whether a file has 16 numbers on its first line, unlike a trajectory of TUM's."""
-    return len(read_text(path).lstrip().split("\n", 1)[0].split()) == 16
+    return len(read_bounded(path).lstrip().split("\n", 1)[0].split()) == 16
 
 
 def list_frames(contents: Contents) -> Listed:

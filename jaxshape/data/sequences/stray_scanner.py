@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
+from jaxshape.data.sequences.documents import read_bounded, rows_of
 from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError, read_shape
 from jaxshape.data.sequences.listing import (
     Contents,
@@ -20,7 +21,6 @@ from jaxshape.data.sequences.listing import (
     partners,
 )
 from jaxshape.data.sequences.poses import from_quaternions, known
-from jaxshape.data.sequences.texts import read_text, rows_of
 
 _FILM = (1440, 1920)
 """Height and width of the film, of which the camera is."""
@@ -68,7 +68,7 @@ def list_frames(contents: Contents) -> Listed:
 
 def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
     """The columns of the table by their names; NaN where a cell is empty."""
-    lines = list(csv.reader(read_text(path).splitlines()))
+    lines = list(csv.reader(read_bounded(path).splitlines()))
     names = [name.strip() for name in lines[0]] if lines else []
     if missing := [name for name in _COLUMNS if name not in names]:
         raise SequenceError(

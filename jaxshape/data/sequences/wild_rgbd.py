@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxshape.data.sequences.cameras import Calibration
+from jaxshape.data.sequences.documents import matrix_of, read_json_object, rows_of
 from jaxshape.data.sequences.frames import FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import (
     Contents,
@@ -15,7 +16,6 @@ from jaxshape.data.sequences.listing import (
     partners,
 )
 from jaxshape.data.sequences.poses import known
-from jaxshape.data.sequences.texts import matrix_of, read_json_object, rows_of
 
 _POSES = "cam_poses.txt"
 

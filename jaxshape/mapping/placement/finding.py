@@ -33,6 +33,7 @@ SURE_OF_FRONT = 0.01
 FIRST_FRAMES = 10
 """Frames among which the first that shows the object well is looked for."""
 
+_NEARLY_LEVEL = np.cos(np.radians(50))  # people tilt cameras down to look at things, by so much
 _FLOOR_MARGIN = 0.02  # metres above the floor below which nothing counts as the object
 _ROOM = 0.15  # by which a box that was estimated is enlarged before the object is cut out with it
 
@@ -163,7 +164,8 @@ def _place_first(
     floor = _floor(frame, found)
     up, of_up = _up(floor, T_world_camera, use_pose)
     cut = f"{frame.name}: {found.reason}"
-    doubts = [cut] * (found.confidence < SURE) + [of_up] * (floor is None)
+    is_sure_of_up = floor is not None and floor.confidence >= SURE
+    doubts = [cut] * (found.confidence < SURE) + [of_up] * (not is_sure_of_up)
     T_level_world = np.eye(4)
     T_level_world[:3, :3] = _rotation_onto_y(up)
     prepared = prepare(frame)
@@ -211,10 +213,24 @@ def _up(
     if floor is not None:
         up = T_world_camera[:3, :3] @ np.asarray(floor.plane.normal, np.float64)
         return up, f"Up is the normal of the floor ({floor.confidence:.0%} sure)."
+    of_camera = -T_world_camera[:3, 1]
     if has_poses:
-        return np.array([0.0, 1.0, 0.0]), "No floor is seen; the world's +y is taken as up."
-    up = -T_world_camera[:3, 1]
-    return up, "No floor is seen; the camera of the first frame is taken as held level."
+        axis, cosine = _nearest_axis(of_camera)
+        if cosine > _NEARLY_LEVEL:
+            name = "xyz"[int(np.argmax(np.abs(axis)))]
+            sign = "+" if axis.sum() > 0 else "-"
+            return axis, (
+                f"No floor is seen; the world's {sign}{name} is taken as up, the axis nearest to "
+                "the image's."
+            )
+    return of_camera, "No floor is seen; the camera of the first frame is taken as held level."
+
+
+def _nearest_axis(up: Float[np.ndarray, " 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    """The axis of the world, of either sign, nearest to a direction, and the cosine to it."""
+    axis = np.zeros(3)
+    axis[np.argmax(np.abs(up))] = np.sign(up[np.argmax(np.abs(up))])
+    return axis, float(axis @ up)
 
 
 def _floor_height(floor: Floor | None, T_level_camera: Float[np.ndarray, "4 4"]) -> float:

@@ -9,19 +9,20 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.errors import SequenceError
+from jaxshape.data.sequences.text import number, read_text, words_of
 
 MAX_BYTES = 256 * 2**20
 """Size up to which a text file is read; an hour of poses takes a tenth of it."""
 
 
-def read_text(path: Path) -> str:
-    """Read a text file as UTF-8; `SequenceError` if it is no regular file, too large, or binary."""
+def read_bounded(path: Path) -> str:
+    """Read a text, as `read_text`; `SequenceError` if it is no regular file, large, or binary."""
     try:
         if not path.is_file():
             raise ValueError("it is missing, or not a regular file")
         if (size := path.stat().st_size) > MAX_BYTES:
             raise ValueError(f"it has {size / 2**20:.0f} MB, more than {MAX_BYTES / 2**20:.0f}")
-        return path.read_text(encoding="utf-8-sig")
+        return read_text(path)
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} cannot be read ({error}); expected a text file: copy it again from its source."
@@ -30,7 +31,7 @@ def read_text(path: Path) -> str:
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds one object; `SequenceError` if it holds anything else."""
-    text = read_text(path)
+    text = read_bounded(path)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -61,23 +62,20 @@ def matrix_of(
 def rows_of(path: Path, columns: Iterable[int]) -> list[list[float]]:
     """Rows of numbers of a text file, each with one of the numbers of `columns`.
 
-    Words are parted by spaces or commas; empty lines and those that begin with # are left out.
+    Comments, and commas and brackets between the numbers, are passed over.
     """
     wanted = tuple(columns)
     rows = []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        words = line.replace(",", " ").split()
-        if not words or words[0].startswith("#"):
-            continue
+    for line, words in words_of(read_bounded(path)):
         try:
-            row = [float(word) for word in words]
+            row = [number(word) for word in words]
         except ValueError as error:
             raise SequenceError(
-                f"{path}, line {number}: {error}; expected numbers alone: write it again."
+                f"{path}, line {line}: {error}; expected numbers alone: write it again."
             ) from error
         if len(row) not in wanted:
             raise SequenceError(
-                f"{path}, line {number} holds {len(row)} numbers; expected "
+                f"{path}, line {line} holds {len(row)} numbers; expected "
                 f"{' or '.join(map(str, wanted))}: write it again."
             )
         rows.append(row)
