@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxshape.data.sequences import Frame, Sequence, SequenceError
+from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.mapping.map.cutting import cut_all, cut_new, is_outgrown, parts_in
 from jaxshape.mapping.map.mapper import Mapper, Step
 from jaxshape.mapping.map.state import MapState
 from jaxshape.mapping.placement.finding import Start, on_the_floor, placed_again, room, with_room
-from jaxshape.mapping.tracking.keyframes import as_pose, prepare
+from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.reconstruction import Reconstruction
 
@@ -71,6 +71,11 @@ class Progress(NamedTuple):
     start: Start
     logs: tuple[FrameLog, ...]
     shape: Reconstruction | None = None
+
+    def of_keyframes(self) -> Iterator[tuple[FrameLog, Keyframe]]:
+        """The log of each keyframe, and the keyframe as the map keeps it."""
+        logs = (log for log in self.logs if log.status == "keyframe")
+        return zip(logs, self.state.keyframes, strict=True)
 
 
 def follow(

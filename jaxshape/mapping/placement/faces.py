@@ -15,10 +15,10 @@ from jaxshape.mapping.placement.placing import PlacementConfig
 from jaxshape.mapping.tracking.keyframes import Keyframe
 
 FACES = (("left side", "right side"), ("bottom", "top"), ("back", "front"))
-"""Names of the faces on the lower and the upper end of each axis, for one who sits on the object."""
+"""Names of the faces on the lower and the upper end of each axis, as one who sits there says."""
 
-SEEN = 0.6
-"""Share of the space just outside of what was measured that rays must pass for a face to be seen."""
+SEEN = 0.5
+"""Share of the space just outside of the object that rays must pass for a face to be seen."""
 
 BEYOND = 0.05
 """Depth of that space, in metres."""
@@ -83,9 +83,11 @@ def faces_of(box: Box, views: list[Cutout]) -> Faces | None:
         return None
     ordered = np.sort(points, axis=0)
     lower, upper = ordered[stray], ordered[-1 - stray]
-    free = [[_free(box, lower, upper, axis, side, views) for axis in range(3)]
-            for side in (0, 1)]  # fmt: skip
-    return Faces(lower, upper, np.array(free) > SEEN)
+    passed = [
+        [_passed_outside(box, lower, upper, axis, side, views) for axis in range(3)]
+        for side in (0, 1)
+    ]
+    return Faces(lower, upper, np.array(passed) > SEEN)
 
 
 def fitted(box: Box, faces: Faces | None) -> Box:
@@ -108,29 +110,31 @@ def between(box: Box, lower: Float[np.ndarray, " 3"], upper: Float[np.ndarray, "
     return Box(T, upper - lower, box.exclude - middle)
 
 
-def reach_of(box: Box, config: PlacementConfig = PlacementConfig()) -> tuple[Box, Box]:
+def reach_of(box: Box) -> tuple[Box, Box]:
     """The largest box that an object may fill which is known to fill this one, and its column.
 
     Returns:
-        The box that reaches to all sides as far as the prior's largest objects do, but not below a
-        floor; and the part of it above and below the given box.
+        The box that reaches to all sides as far as the prior's largest objects do, but not into
+        what is excluded; and the part of it above and below the given box.
     """
-    largest = np.array(config.typical_size) * np.exp(SPREADS * np.array(config.size_spread))
-    largest[[0, 2]] = largest[[0, 2]].max()  # its front may not be sure
-    more = np.maximum(largest - box.size, 0)
+    more = np.maximum(_largest() - box.size, 0)
     lower, upper = -box.size / 2, box.size / 2
-    below = more * [1, not len(box.exclude), 1]
     vertical = np.array([0.0, 1.0, 0.0])
-    room = 0.1 * box.size * (1 - vertical)
-    return (
-        between(box, lower - below, upper + more),
-        between(box, lower - below * vertical - room, upper + more * vertical + room),
-    )
+    around = more * vertical + 0.1 * box.size * (1 - vertical)
+    return between(box, lower - more, upper + more), between(box, lower - around, upper + around)
 
 
-def tallest(config: PlacementConfig = PlacementConfig()) -> float:
+def tallest() -> float:
     """Height of the prior's largest objects, in metres."""
-    return float(config.typical_size[1] * np.exp(SPREADS * config.size_spread[1]))
+    return float(_largest()[1])
+
+
+def _largest() -> Float[np.ndarray, " 3"]:
+    """Extents of the prior's largest objects, in metres, whichever way their front is turned."""
+    config = PlacementConfig()
+    largest = np.array(config.typical_size) * np.exp(SPREADS * np.array(config.size_spread))
+    largest[[0, 2]] = largest[[0, 2]].max()
+    return largest
 
 
 # Points ------------------------------------------------------------------------------------------
@@ -159,7 +163,7 @@ def in_object(points: Float[np.ndarray, "n 3"], box: Box) -> Float[np.ndarray, "
     return (points - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
 
 
-def _free(
+def _passed_outside(
     box: Box,
     lower: Float[np.ndarray, " 3"],
     upper: Float[np.ndarray, " 3"],
@@ -167,21 +171,24 @@ def _free(
     side: int,
     views: list[Cutout],
 ) -> float:
-    """Share of the space just outside of one end of the object that rays of some keyframe passed.
+    """Share of the space just outside of one end of the object that rays of some view passed.
 
-    The space lies before the middle of the face; near its rims most is seen past the object.
+    The space lies before the middle of the face, down to the bottom of the box: where the back of a
+    chair is all that was measured, the air before it says nothing of the seat. Of its halves, the
+    upper and the lower, the one counts that rays passed less.
     """
-    rims = 0.1 * (upper - lower)
-    low, high = lower + rims, upper - rims
+    low, high = np.minimum(lower, -box.size / 2), np.maximum(upper, box.size / 2)
+    rims = 0.1 * (high - low)
+    low, high = low + rims, high - rims
     low[axis] = upper[axis] + CLEAR if side else lower[axis] - BEYOND
     high[axis] = upper[axis] + BEYOND if side else lower[axis] - CLEAR
     steps = [np.linspace(low[i], high[i], 3 if i == axis else 12) for i in range(3)]
     points = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = points @ box.T_world_object[:3, :3].T + box.T_world_object[:3, 3]
-    passed = np.zeros(len(points), bool)
-    for one in views:
-        passed |= _passed(points, one)
-    return float(passed.mean())
+    world = points @ box.T_world_object[:3, :3].T + box.T_world_object[:3, 3]
+    passed = np.any([_passed(world, one) for one in views], axis=0)
+    is_upper = points[:, 1] > np.median(points[:, 1])
+    halves = [passed[is_upper], passed[~is_upper]]
+    return min(float(half.mean()) for half in halves if len(half))
 
 
 def _passed(points: Float[np.ndarray, "n 3"], view: Cutout) -> Bool[np.ndarray, " n"]:
