@@ -34,7 +34,12 @@ FURTHER = 0.03
 
 
 def parts_in(prepared: PreparedFrame, *, first: bool = False) -> Parts:
-    """The parts of a frame at working size; of the first one, its object is known."""
+    """The parts of a frame at working size.
+
+    Args:
+        prepared: The frame.
+        first: Whether it is the first frame, whose mask shows the object.
+    """
     fx, fy, cx, cy = (float(x) for x in prepared.view.intrinsics)
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     sure = np.asarray(prepared.masked) if first else None
@@ -51,6 +56,9 @@ def cut_new(
         keyframes: The keyframes before it.
         box: The box that the object is cut out with.
         T_world_camera: Pose of the frame.
+
+    Returns:
+        The parts, and True on pixels that show the object `[h w]`.
     """
     parts = parts_in(prepared)
     T = np.asarray(T_world_camera.as_matrix(), np.float64)
@@ -63,7 +71,12 @@ def cut_new(
 def cut_all(keyframes: tuple[Keyframe, ...], box: Box) -> tuple[Keyframe, ...]:
     """The keyframes with the pixels that show the object, given its box.
 
-    Those whose object was given by a mask stay as they are.
+    Args:
+        keyframes: The keyframes of a map.
+        box: The box that the object is cut out with.
+
+    Returns:
+        The keyframes; those whose object was given by a mask are as they were.
     """
     found = belonging(_all_seen(keyframes), box, *reach_of(box))
     return tuple(
@@ -73,7 +86,12 @@ def cut_all(keyframes: tuple[Keyframe, ...], box: Box) -> tuple[Keyframe, ...]:
 
 
 def is_outgrown(box: Box, keyframes: tuple[Keyframe, ...]) -> bool:
-    """Whether more was measured of the object, outside of its box, than noise."""
+    """Whether more was measured of the object, outside of its box, than noise.
+
+    Args:
+        box: The object's box.
+        keyframes: The keyframes of a map.
+    """
     points = in_object(object_points(cutouts(keyframes)), box)
     outside = (np.abs(points) > box.size / 2 + FURTHER).any(axis=1)
     return len(points) > 0 and bool(outside.mean() > OUTSIDE)

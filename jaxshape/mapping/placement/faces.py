@@ -54,7 +54,14 @@ class Cutout(NamedTuple):
 
 
 def cutouts(keyframes: tuple[Keyframe, ...]) -> list[Cutout]:
-    """The object in each keyframe."""
+    """The object in each keyframe.
+
+    Args:
+        keyframes: The keyframes of a map.
+
+    Returns:
+        The cutout of each, in the same order.
+    """
     return [
         Cutout(one.depth, one.segmented, one.intrinsics, np.asarray(one.T_world_camera.as_matrix()))
         for one in keyframes
@@ -76,7 +83,15 @@ class Faces(NamedTuple):
 
 
 def faces_of(box: Box, views: list[Cutout]) -> Faces | None:
-    """The ends of what the keyframes measured of the object; None where they measured nothing."""
+    """The ends of what was measured of the object along the axes of its box.
+
+    Args:
+        box: The object's box, whose axes count, and whose size tells how large its faces are.
+        views: Views of the object.
+
+    Returns:
+        The ends, and whether the object was seen to end there; None where nothing was measured.
+    """
     points = in_object(object_points(views), box)
     stray = int(len(points) * STRAY)
     if len(points) < 3:
@@ -91,7 +106,15 @@ def faces_of(box: Box, views: list[Cutout]) -> Faces | None:
 
 
 def fitted(box: Box, faces: Faces | None) -> Box:
-    """The box with every face that was seen where the object ends, and none that cuts it."""
+    """The box with every face that was seen where the object ends, and none that cuts it.
+
+    Args:
+        box: The object's box.
+        faces: The ends of the object along its axes; None where nothing was measured.
+
+    Returns:
+        The box; if it stands on a floor, which it then excludes, its bottom stays.
+    """
     if faces is None:
         return box
     half = box.size / 2
@@ -103,7 +126,16 @@ def fitted(box: Box, faces: Faces | None) -> Box:
 
 
 def between(box: Box, lower: Float[np.ndarray, " 3"], upper: Float[np.ndarray, " 3"]) -> Box:
-    """The box with other corners, given in its own object frame."""
+    """The box with other corners, given in its own object frame.
+
+    Args:
+        box: The box, whose axes stay.
+        lower: Its new lowest corner `[3]`, in metres.
+        upper: Its new highest corner `[3]`, in metres.
+
+    Returns:
+        The box, which excludes the same part of the world.
+    """
     middle = (lower + upper) / 2
     T = box.T_world_object.copy()
     T[:3, 3] += T[:3, :3] @ middle
@@ -112,6 +144,9 @@ def between(box: Box, lower: Float[np.ndarray, " 3"], upper: Float[np.ndarray, "
 
 def reach_of(box: Box) -> tuple[Box, Box]:
     """The largest box that an object may fill which is known to fill this one, and its column.
+
+    Args:
+        box: The object's box, as far as it is known.
 
     Returns:
         The box that reaches to all sides as far as the prior's largest objects do, but not into
@@ -141,14 +176,28 @@ def _largest() -> Float[np.ndarray, " 3"]:
 
 
 def object_points(views: list[Cutout]) -> Float[np.ndarray, "n 3"]:
-    """Points of the object in the world, in metres."""
+    """Points of the object in the world.
+
+    Args:
+        views: Views of the object.
+
+    Returns:
+        The points of all segmented pixels that have a depth `[n 3]`, in metres.
+    """
     clouds = [world_points(one)[np.asarray(one.segmented)] for one in views]
     points = np.concatenate([np.zeros((0, 3)), *clouds])
     return points[np.isfinite(points).all(axis=1)]
 
 
 def world_points(view: Cutout) -> Float[np.ndarray, "h w 3"]:
-    """The point of each pixel in the world, in metres; NaN where nothing was measured."""
+    """The point of each pixel in the world.
+
+    Args:
+        view: The view.
+
+    Returns:
+        The points `[h w 3]`, in metres; NaN where nothing was measured.
+    """
     fx, fy, cx, cy = (float(x) for x in view.intrinsics)
     z = np.asarray(view.depth, np.float64)
     z = np.where((z > 0) & np.isfinite(z), z, np.nan)
@@ -159,7 +208,12 @@ def world_points(view: Cutout) -> Float[np.ndarray, "h w 3"]:
 
 
 def in_object(points: Float[np.ndarray, "n 3"], box: Box) -> Float[np.ndarray, "n 3"]:
-    """Points of the world in the object frame of a box."""
+    """Points of the world in the object frame of a box.
+
+    Args:
+        points: Points in the world `[n 3]`, in metres.
+        box: The box.
+    """
     return (points - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
 
 

@@ -89,7 +89,11 @@ def room(start: Start) -> float:
 
 
 def with_room(start: Start) -> Box:
-    """The box that the object is cut out with."""
+    """The box that the object is cut out with.
+
+    Args:
+        start: The object, with its latest box.
+    """
     return start.box._replace(size=(1 + room(start)) * start.box.size)
 
 
@@ -267,6 +271,13 @@ def on_the_floor(start: Start, keyframes: tuple[Keyframe, ...]) -> Start:
 
     Of several floors the surest counts, if all that was measured of the object lies above it, and
     no higher than the prior's largest objects reach.
+
+    Args:
+        start: The object, with its latest box.
+        keyframes: The keyframes of the map.
+
+    Returns:
+        The start with its up and its box as the floor asks; the same one where nothing changes.
     """
     assert start.T_level_world is not None
     points = object_points(cutouts(keyframes))

@@ -59,10 +59,10 @@ class _Part(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What is known after some frames: points of the object, and points of other things."""
+    """What was measured, in trees that find the nearest point: the object, and other things."""
 
-    ours: Float[np.ndarray, "n 3"]
-    others: Float[np.ndarray, "m 3"]
+    ours: KDTree
+    others: KDTree
 
 
 def belonging(
@@ -83,24 +83,24 @@ def belonging(
     parts = [part for i, seen in enumerate(frames) for part in _parts(i, seen, box, reach, column)]
     sure = [seen.points[seen.sure & points_in_box(seen.points, reach)] for seen in frames]
     background = [_background(seen, column) for seen in frames]
-    known, whole = _Known(_cloud(sure), _cloud(background)), set()
+    known, whole = _Known(_tree(sure), _tree(background)), set()
     for _ in range(ROUNDS):
         ours = [part for part in parts if _is_ours(part, known.ours)]
         taken = {part[:2] for part in ours}
         apart = [part for part in parts if part[:2] not in taken and part.in_column < MOSTLY]
-        known = known._replace(others=_cloud([*background, *(part.points for part in apart)]))
+        known = known._replace(others=_tree([*background, *(part.points for part in apart)]))
         before, whole = whole, {part[:2] for part in ours if _is_whole(part, known)}
         if whole == before:
             break
         more = [part.points for part in ours if part[:2] in whole]
-        known = known._replace(ours=_cloud([*sure, *more]))
+        known = known._replace(ours=_tree([*sure, *more]))
     return [
         _pixels(seen, [p for p in ours if p.frame == i], whole, known, box, reach)
         for i, seen in enumerate(frames)
     ]
 
 
-def _is_ours(part: _Part, ours: Float[np.ndarray, "n 3"]) -> bool:
+def _is_ours(part: _Part, ours: KDTree) -> bool:
     """Whether a part is the object, all of it or some."""
     return part.in_box > MOSTLY or float(_near(part.points, ours).mean()) > AGAIN
 
@@ -115,12 +115,8 @@ def _foreign(points: Float[np.ndarray, "n 3"], known: _Known) -> Bool[np.ndarray
     return _near(points, known.others) & ~_near(points, known.ours)
 
 
-def _near(
-    points: Float[np.ndarray, "n 3"], cloud: Float[np.ndarray, "m 3"]
-) -> Bool[np.ndarray, " n"]:
-    if not len(cloud) or not len(points):
-        return np.zeros(len(points), bool)
-    return np.isfinite(KDTree(cloud).query(points, distance_upper_bound=NEAR)[0])
+def _near(points: Float[np.ndarray, "n 3"], tree: KDTree) -> Bool[np.ndarray, " n"]:
+    return np.isfinite(tree.query(points, distance_upper_bound=NEAR)[0])
 
 
 def _pixels(
@@ -156,8 +152,8 @@ def _background(seen: Seen, column: Box) -> Float[np.ndarray, "n 3"]:
     return points[points_in_box(points, column)][::3]
 
 
-def _cloud(clouds: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "n 3"]:
+def _tree(clouds: list[Float[np.ndarray, "_ 3"]]) -> KDTree:
     """Points of some clouds, one in each small cell."""
     points = np.concatenate([np.zeros((0, 3)), *clouds])
     cells = np.floor(points / _SPACING).astype(np.int64)
-    return points[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+    return KDTree(points[np.sort(np.unique(cells, axis=0, return_index=True)[1])])
