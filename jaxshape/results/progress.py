@@ -22,6 +22,7 @@ from jaxshape.data.sequences.cameras import intrinsic_numbers
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grids import binary
+from jaxshape.mapping.map.doubts import doubts_of
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.map.state import MapState, grids_of
 from jaxshape.mapping.placement.finding import Start
@@ -62,7 +63,7 @@ def write_progress(
     if not running:
         keyframes, floor = seen_views(progress.state), floor_height(start)
         observation = observation._replace(keyframes=keyframes, floor=floor)
-    warnings = [*figures.get("warnings", ()), *start.warnings]
+    warnings = [*figures.get("warnings", ()), *start.warnings, *doubts_of(progress)]
     result = {**figures, **counts(progress), "notes": start.notes, "warnings": warnings}
     result["box"] = {
         "T_world_object": start.box.T_world_object.tolist(),
@@ -133,7 +134,7 @@ def counts(progress: Progress) -> dict[str, int]:
         "frames_tracked": statuses.count("tracked") + statuses.count("keyframe"),
         "frames_lost": statuses.count("lost"),
         "frames_unreadable": statuses.count("unreadable"),
-        "keyframes": len(progress.state.keyframes),
+        "keyframes": sum(1 for _ in _fused(progress)),
     }
 
 
@@ -150,9 +151,8 @@ def _crop(depth: np.ndarray, segmented: np.ndarray) -> np.ndarray:
 
 
 def _fused(progress: Progress) -> Iterator[tuple[FrameLog, Keyframe]]:
-    """The log of each keyframe, and the keyframe as the map keeps it."""
-    logs = (log for log in progress.logs if log.status == "keyframe")
-    return zip(logs, progress.state.keyframes, strict=True)
+    """The keyframes that show the object."""
+    return (pair for pair in progress.of_keyframes() if np.asarray(pair[1].segmented).any())
 
 
 def _write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> None:
@@ -195,8 +195,17 @@ def _keyframes(sequence: Sequence, progress: Progress) -> dict[str, Any]:
             }
             for log, keyframe in _fused(progress)
         ],
-        "frames": [_frame_entry(log, poses) for log in progress.logs],
+        "frames": [_frame_entry(log, poses) for log in _as_fused(progress)],
     }  # fmt: skip
+
+
+def _as_fused(progress: Progress) -> Iterator[FrameLog]:
+    """The logs of all frames; a keyframe without the object is one that was tracked."""
+    fused = {log.index for log, _ in _fused(progress)}
+    reason = "no pixel was taken for the object"
+    for log in progress.logs:
+        is_empty = log.status == "keyframe" and log.index not in fused
+        yield log._replace(status="tracked", reason=reason) if is_empty else log
 
 
 def _frame_entry(log: FrameLog, poses: dict[int, np.ndarray]) -> dict[str, Any]:

@@ -71,9 +71,17 @@ class Scene(NamedTuple):
         return self.points[..., 2]
 
 
-def look(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> Scene:
-    """The reduced frame, its planes, and the floor among them."""
-    stride = max(1, round(depth.shape[1] / WORKING_WIDTH))
+def look(
+    depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"], stride: int | None = None
+) -> Scene:
+    """The reduced frame, its planes, and the floor among them.
+
+    Args:
+        depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
+        K: Camera matrix `[3 3]`, in pixels.
+        stride: Of this many rows and columns one is kept; None for about the working width.
+    """
+    stride = stride or max(1, round(depth.shape[1] / WORKING_WIDTH))
     points = reduced(camera_points(depth, K), stride)
     cloud = points.reshape(-1, 3)
     planes = dominant_planes(cloud)

@@ -11,11 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.ndimage import mean
-from scipy.spatial import KDTree
 
 from jaxshape import checks
-from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.mapping.segmentation.clusters import (
     Pixel,
     Scene,
@@ -33,15 +30,6 @@ from jaxshape.mapping.segmentation.feet import feet_on
 
 CLICK_RADIUS = 4.0
 """Radius around a click in which the object may lie, in pixels of the reduced image."""
-
-MOSTLY = 0.5
-"""Share of a cluster that must lie in the object's box to be part of it."""
-
-NEAR = 0.03
-"""Metres within which two frames have measured the same thing."""
-
-NOTHING = np.zeros((0, 3))
-"""No points."""
 
 CANDIDATES = 5
 """Clusters that are joined with what belongs to them before one is chosen."""
@@ -138,40 +126,6 @@ def segment(
         segmented |= feet_on(segmented, reduced(color, view.stride), view, view.floor.plane)
     doubts = [doubt, *doubts_of(segmented, behind, view, clicked=clicked)]
     return Segmentation(enlarged(segmented, view, depth) & allowed, *judged(doubts, len(chosen)))
-
-
-def segment_inside(
-    depth: Float[np.ndarray, "h w"],
-    K: Float[np.ndarray, "3 3"],
-    box: Box,
-    T_world_camera: Float[np.ndarray, "4 4"],
-    others: Float[np.ndarray, "n 3"] = NOTHING,
-) -> Bool[np.ndarray, "h w"]:
-    """Find the pixels of a later frame that show the object, of which a box is known. [host]
-
-    Clusters count that lie mostly in the box and mostly not where earlier frames saw other things:
-    a table that reaches into the box is left out, and parts of the object outside of it are not
-    lost.
-
-    Args:
-        depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
-        K: Camera matrix `[3 3]`, in pixels.
-        box: The object's box in the world.
-        T_world_camera: Pose of the frame `[4 4]`.
-        others: World points at which earlier frames saw other things `[n 3]`, in metres.
-    """
-    view = look(depth, K)
-    known = np.isfinite(view.z)
-    points = view.points[known] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    ours = points_in_box(points, box)
-    if len(others):
-        ours &= np.isinf(KDTree(others).query(points, distance_upper_bound=NEAR)[0])
-    inside = np.zeros(known.shape, bool)
-    inside[known] = ours
-    labels = clusters(view, known & ~background(view, None))
-    shares = np.asarray(mean(inside, labels, np.arange(labels.max() + 1)))
-    chosen = np.flatnonzero(shares > MOSTLY)
-    return enlarged(np.isin(labels, chosen[chosen > 0]), view, depth)
 
 
 def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:
