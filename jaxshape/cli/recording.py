@@ -4,7 +4,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.markup import escape
@@ -30,6 +30,8 @@ class Reconstruct(Rebuild):
     jaxshape reconstruct scan/ --click 320 240 --poses none
 
     jaxshape reconstruct scan/ --box box.json --every 5
+
+    jaxshape reconstruct scan/ --list, then jaxshape reconstruct scan/ --object 2
     """
 
     frames: Positional[Path]
@@ -40,6 +42,10 @@ class Reconstruct(Rebuild):
     """Left, top, right and bottom of a part of the first frame that holds the object alone."""
     depth_range: tuple[float, float] | None = None
     """Nearest and farthest depth of the object in the first frame, in metres."""
+    list_objects: Annotated[bool, tyro.conf.arg(name="list")] = False
+    """Number the objects that the first frame shows in objects.png, and do nothing else."""
+    object: int | None = None
+    """Number of the object, as --list shows them."""
     box: Path | None = None
     """JSON file with the object's box: {"T_world_object": 4x4, "size": [x, y, z]}. The object
     frame has +y up and its front along +z; the world is that of the poses or, without poses, the
@@ -93,7 +99,9 @@ class Reconstruct(Rebuild):
             self.first < len(sequence),
             f"--first is {self.first}, but there are {len(sequence)} frames, counted from 0.",
         )
-        prompt = Prompt(self.click, self.region, self.depth_range)
+        if self.list_objects:
+            return self._list_objects(sequence)
+        prompt = Prompt(self.click, self.region, self.depth_range, self.object)
         check_prompt(prompt, sequence.shape)
         box = read_box(self.box) if self.box else None
         use_poses = self._use_poses(inspected)
@@ -177,6 +185,23 @@ class Reconstruct(Rebuild):
         )
         stated, keep_scale = self.convention or None, self.depth_scale is not None
         return inspect_sequence(sequence, stated, keep_scale=keep_scale)
+
+    def _list_objects(self, sequence: Any) -> None:
+        """Write a picture of what the first frame shows, and the size of each object."""
+        from jaxshape.mapping.placement.finding import first_readable
+        from jaxshape.mapping.segmentation.proposals import propose
+        from jaxshape.report.proposals import write_proposals
+
+        use_pose = self.poses != "none" and sequence.has_poses
+        _, frame = first_readable(sequence, self.first, use_pose)
+        found = propose(frame.depth, frame.intrinsics)
+        require(bool(found), f"{frame.name} shows floor and walls alone; give another --first.")
+        picture = self.output / "objects.png"
+        write_proposals(picture, frame.depth, frame.color, [one.segmented for one in found])
+        for number, one in enumerate(found, 1):
+            size = " x ".join(f"{extent:.2f}" for extent in one.size)
+            print(f"{number}: {size} m (width, height, depth), {one.distance:.2f} m away")
+        print(f"wrote {picture} of {frame.name}; take one with --object and its number")
 
     def _use_poses(self, inspected: Any) -> bool:
         """Whether all given poses are used; refuses options that contradict the recording."""

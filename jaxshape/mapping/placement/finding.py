@@ -131,7 +131,7 @@ def find_start(
     """
     use_pose = use_pose and sequence.has_poses
     if box is not None:
-        index, frame = _first_readable(sequence, first, use_pose)
+        index, frame = first_readable(sequence, first, use_pose)
         T = _world_pose(frame, use_pose)
         return Start(index, frame.mask, box, T, None, np.nan, None, (), ())
     reasons = []
@@ -160,7 +160,17 @@ def _is_prompted(prompt: Prompt) -> bool:
     return prompt != Prompt()
 
 
-def _first_readable(sequence: Sequence, first: int, use_pose: bool) -> tuple[int, Frame]:
+def first_readable(sequence: Sequence, first: int, use_pose: bool) -> tuple[int, Frame]:
+    """The first frame from a number on that can be read, and its number.
+
+    Args:
+        sequence: The recording.
+        first: Number of the first frame to look at, from 0.
+        use_pose: Whether the frame has to have a pose.
+
+    Raises:
+        SequenceError: There is none.
+    """
     problem: Exception | None = None
     for index in range(first, len(sequence)):
         try:

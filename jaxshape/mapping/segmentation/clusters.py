@@ -39,6 +39,9 @@ HIDDEN = 0.4
 GROWTH = 0.1
 """Largest distance of legs outside the footprint of the parts above them, in metres."""
 
+MOST = 9
+"""Groups of clusters that are proposed as objects."""
+
 SMALLEST = 12
 """Clusters of fewer pixels are noise."""
 
@@ -206,7 +209,8 @@ def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
     Clusters belong together if most of one stands on the footprint of the other, which is no larger
     than furniture, or if one is much smaller and next to the other in space.
     """
-    clouds = {label: view.points[labels == label] for label in range(1, labels.max() + 1)}
+    present = np.unique(labels[labels > 0]).tolist()
+    clouds = {label: view.points[labels == label] for label in present}
     chosen, others = [main], set(clouds) - {main}
     while True:
         body = np.concatenate([clouds[label] for label in chosen])
@@ -214,6 +218,18 @@ def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
         if not new:
             return chosen
         chosen, others = chosen + new, others - set(new)
+
+
+def groups(labels: Int[np.ndarray, "h w"], view: Scene) -> list[list[int]]:
+    """The largest clusters, each with those that belong to it and to no larger one."""
+    sizes = np.bincount(labels.ravel())[1:]
+    found, left = [], labels.copy()
+    for seed in np.argsort(-sizes, kind="stable")[: 4 * MOST] + 1:
+        if (left == seed).any():
+            found.append(joined(left, int(seed), view))
+            left[np.isin(left, found[-1])] = 0
+    found.sort(key=lambda group: -sizes[np.array(group) - 1].sum())
+    return found[:MOST]
 
 
 def _belongs(

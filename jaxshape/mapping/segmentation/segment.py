@@ -21,6 +21,7 @@ from jaxshape.mapping.segmentation.clusters import (
     cut,
     distance,
     enlarged,
+    groups,
     joined,
     look,
     reduced,
@@ -58,6 +59,8 @@ class Prompt:
         region: `(left, top, right, bottom)` around the object, in pixels; None for the whole image.
         depth_range: Nearest and farthest depth of the object, in metres, 0 or more; None for any
             depth.
+        number: Number of the object, from 1, among those that `propose` finds in the same image;
+            None for no number.
 
     Raises:
         ValueError: A coordinate is outside its range, or an interval is empty.
@@ -66,6 +69,7 @@ class Prompt:
     click: tuple[float, float] | None = None
     region: tuple[float, float, float, float] | None = None
     depth_range: tuple[float, float] | None = None
+    number: int | None = None
 
     def __post_init__(self) -> None:
         for coordinate in self.click or ():
@@ -78,6 +82,8 @@ class Prompt:
         if not 0 <= near < far:
             wanted = "the nearest, then the farthest depth, in metres"
             checks.refuse("depth_range", self.depth_range, wanted)
+        if self.number is not None:
+            checks.whole("number", self.number, 1)
 
 
 def segment(
@@ -104,7 +110,7 @@ def segment(
         mask: True on the object `[h w]`; None to find it.
 
     Raises:
-        ValueError: No pixel of the image can meet the prompt.
+        ValueError: No pixel of the image can meet the prompt, or no object has its number.
     """
     check_prompt(prompt, depth.shape)
     measured = (depth > 0) & np.isfinite(depth)
@@ -120,11 +126,15 @@ def segment(
     labels = clusters(view, reduced(allowed, view.stride) & ~behind)
     if labels.max() == 0:
         return _nothing(measured, "Nothing but floor, walls and table tops is seen there")
-    chosen, doubt = (_nearest if clicked else _most_central)(labels, view, target)
+    if prompt.number is not None:
+        chosen, doubt = _numbered(labels, view, prompt.number)
+    else:
+        chosen, doubt = (_nearest if clicked else _most_central)(labels, view, target)
     segmented = np.isin(labels, chosen)
     if color is not None and view.floor is not None:
         segmented |= feet_on(segmented, reduced(color, view.stride), view, view.floor.plane)
-    doubts = [doubt, *doubts_of(segmented, behind, view, clicked=clicked)]
+    is_told = clicked or prompt.number is not None
+    doubts = [doubt, *doubts_of(segmented, behind, view, clicked=is_told)]
     return Segmentation(enlarged(segmented, view, depth) & allowed, *judged(doubts, len(chosen)))
 
 
@@ -200,6 +210,17 @@ def _nearest(labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel) -> tupl
     ]
     hit = np.argmin(depths) if np.isfinite(depths).any() else np.argmin(away)
     return joined(labels, int(hit) + 1, view), doubt
+
+
+def _numbered(labels: Int[np.ndarray, "h w"], view: Scene, number: int) -> tuple[list[int], Doubt]:
+    """The group of clusters of this number, which a user chose from a picture of them."""
+    found = groups(labels, view)
+    if number > len(found):
+        raise ValueError(
+            f"The object has the number {number}, and {len(found)} are seen there; see them with "
+            "--list."
+        )
+    return found[number - 1], (1.0, "it was chosen")
 
 
 def _most_central(
