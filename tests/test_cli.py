@@ -36,7 +36,9 @@ from jaxshape.results.traces import read_search
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import families
 
-COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
+COMMANDS = (
+    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view"
+)  # fmt: skip
 
 
 @pytest.fixture

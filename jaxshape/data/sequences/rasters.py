@@ -76,7 +76,7 @@ def _read_exr(path: Path) -> np.ndarray:
     except ImportError:
         raise SequenceError(
             f"{path} is an EXR image, which needs a package of its own to be read: pip install "
-            "OpenEXR, or save the depth images as 16-bit PNG in millimetres."
+            "'jaxshape[exr]', or save the depth images as 16-bit PNG in millimetres."
         ) from None
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

@@ -42,6 +42,9 @@ GROWTH = 0.1
 MOST = 9
 """Groups of clusters that are proposed as objects."""
 
+SPECK = 0.003
+"""Share of the image below which a group of clusters is not proposed."""
+
 SMALLEST = 12
 """Clusters of fewer pixels are noise."""
 
@@ -228,8 +231,9 @@ def groups(labels: Int[np.ndarray, "h w"], view: Scene) -> list[list[int]]:
         if (left == seed).any():
             found.append(joined(left, int(seed), view))
             left[np.isin(left, found[-1])] = 0
-    found.sort(key=lambda group: -sizes[np.array(group) - 1].sum())
-    return found[:MOST]
+    total = {tuple(group): sizes[np.array(group) - 1].sum() for group in found}
+    found = [group for group in found if total[tuple(group)] >= SPECK * labels.size]
+    return sorted(found, key=lambda group: -total[tuple(group)])[:MOST]
 
 
 def _belongs(

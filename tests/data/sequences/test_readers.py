@@ -313,7 +313,7 @@ def test_exr_is_read_or_refused_by_name(tmp_path):
         import OpenEXR
     except ImportError:
         path.write_bytes(b"\x76\x2f\x31\x01")
-        assert "pip install OpenEXR" in fault_of(tmp_path)
+        assert "jaxshape[exr]" in fault_of(tmp_path)
         return
     depth = SEEN.depth[0].astype(np.float32)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
