@@ -52,7 +52,11 @@ def test_poses_tell_a_wrong_depth_scale(tmp_path, written, read):
     "written, read, said",
     [
         (1000, 1.0, "3 km at depth scale 1; expected 0.1 to 20 m Is --depth-scale 1000 meant"),
-        (4000, 1000.0, "12 m at depth scale 1000; .* 0.3 to 7 m .* 4000, 5000, 6553.5 or 10000 meant"),
+        (
+            4000,
+            1000.0,
+            "12 m at depth scale 1000; .* 0.3 to 7 m .* 4000, 5000, 6553.5 or 10000 meant",
+        ),
         (1000, 5000.0, None),
     ],
 )

@@ -55,7 +55,9 @@ def test_times_that_do_not_rise(tmp_path):
     write_tum(tmp_path, SEEN)
     lines = (tmp_path / "depth.txt").read_text().splitlines()
     (tmp_path / "depth.txt").write_text(
-        "\n".join(f"{0.033 + 0.001 * (i % 2)} {line.split()[1]}" for i, line in enumerate(lines[2:]))
+        "\n".join(
+            f"{0.033 + 0.001 * (i % 2)} {line.split()[1]}" for i, line in enumerate(lines[2:])
+        )
     )
     with pytest.raises(SequenceError, match="times that do not rise.*not intervals: write their"):
         open_sequence(tmp_path)
