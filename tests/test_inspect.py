@@ -2,12 +2,15 @@
 
 import json
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxshape import cli
+from jaxshape.cli.inspecting import LayoutName
+from jaxshape.data.sequences import LAYOUTS
 
 
 @pytest.fixture
@@ -83,3 +86,7 @@ def test_what_cannot_be_read_is_refused(inspect, folder, tmp_path):
         path.write_bytes(b"")
     status, out, err = inspect(folder)
     assert status == 2 and not out and "cannot be read as an image" in err
+
+
+def test_every_layout_can_be_asked_for():
+    assert get_args(LayoutName) == tuple(LAYOUTS)

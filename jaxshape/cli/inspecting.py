@@ -10,6 +10,23 @@ from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional
 
+LayoutName = Literal[
+    "7-scenes",
+    "tum",
+    "nerfstudio",
+    "bop",
+    "wildrgb-d",
+    "stray-scanner",
+    "record3d",
+    "scannet",
+    "replica",
+    "npz",
+    "redwood",
+    "bundlesdf",
+    "open3d",
+]
+"""Names of `jaxshape.data.sequences.LAYOUTS`."""
+
 ConventionName = Literal[
     "as-given",
     "wxyz",
@@ -32,11 +49,12 @@ class Inspect:
     """
 
     frames: Positional[Path]
-    """Folder of the recording: 7-Scenes, TUM RGB-D, Redwood, Open3D, or rgb/ depth/ masks/ with
-    cam_K.txt."""
+    """Folder of the recording: 7-Scenes, TUM RGB-D, ScanNet, BOP, WildRGB-D, Redwood, Replica,
+    Open3D, Stray Scanner, Record3D, nerfstudio, or rgb/ depth/ masks/ with cam_K.txt; or an .npz
+    file of arrays."""
     depth_scale: float | None = None
     """Depth units in a metre, above 0; those of the layout by default."""
-    layout: Literal["7-scenes", "tum", "redwood", "bundlesdf", "open3d"] | None = None
+    layout: LayoutName | None = None
     """Layout of the files; detected by default."""
     convention: tuple[ConventionName, ...] = ()
     """Conventions in which the recording is written, where it is not to be found out."""

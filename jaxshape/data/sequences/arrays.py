@@ -38,7 +38,9 @@ def list_frames(contents: Contents) -> Listed:
     Depth is in metres if it is of floats, in millimetres if of integers. Poses are camera to world;
     K is as OpenCV has it, with the centre of the first pixel at 0, 0.
     """
-    path = _files(contents)[0]
+    path = next(iter(sorted(_files(contents))), None)
+    if path is None:
+        raise SequenceError(f"{contents.folder} holds no .npz file; give the one that you mean.")
     arrays = _read(path)
     if "depth" not in arrays:
         raise SequenceError(f"{path} holds no array called depth; expected depth [n h w]: add it.")

@@ -54,9 +54,9 @@ def list_frames(contents: Contents) -> Listed:
     Poses are quaternion and place, camera to world, with ARKit's axes: y up, z backwards. Cameras
     are of the colour images, whose size the metadata give.
     """
-    if not has_depth_folder(contents):
+    if _packed(contents) and not has_depth_folder(contents):
         raise SequenceError(f"{contents.folder} {_PACKED}")
-    source = _metadata(contents)[0]
+    source = next(iter(_metadata(contents)), contents.folder / "metadata.json")
     about, depth = read_json_object(source), depth_images(contents)
     color, masks = partners(depth, color_images(contents)), partners(depth, mask_images(contents))
     confidence = partners(depth, files_in(contents, ("confidence", "conf"), (".png",)))

@@ -21,7 +21,7 @@ from device_recordings import (
 )
 from recordings import OPENCV, H, W, raw, save
 
-from jaxshape.data.sequences import SequenceError, open_sequence
+from jaxshape.data.sequences import LAYOUTS, SequenceError, open_sequence
 
 SEEN = shoot()
 
@@ -116,6 +116,12 @@ def test_damaged_files_end_in_one_sentence(tmp_path, name, file, content):
         WRITERS[name](tmp_path, SEEN)
     (tmp_path / file).write_bytes(content)
     assert fault_of(tmp_path)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_an_empty_folder_is_of_no_layout_that_is_asked_for(tmp_path, name):
+    with pytest.raises(SequenceError, match=r"\.$"):
+        open_sequence(tmp_path, layout=name)
 
 
 # ScanNet, WildRGB-D, Replica -------------------------------------------------------------------
