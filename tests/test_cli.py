@@ -18,7 +18,7 @@ from scene import write_scene
 
 from jaxshape import cli, process
 from jaxshape.cli.learning import preset_in
-from jaxshape.data import dataset, sequences
+from jaxshape.data import dataset
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.chairs import random_chair
