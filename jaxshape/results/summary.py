@@ -35,14 +35,18 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
     if "objective_refined" in result:
         before, after = (number(result.get(f"objective_{n}"), 4) for n in ("encoder", "refined"))
         meaning = (
-            f"nats per voxel of the whole grid ({_minimised(result)}), of the encoder’s code, then "
-            "of the refined one; lower is better"
+            "how far the shape and the measurement disagree, before and after the search; lower is "
+            "better, and it only compares searches on the same frames: nats per voxel of the whole "
+            f"grid ({_minimised(result)})"
         )
         yield Figure("Objective", f"{before} → {after}", meaning)
     if "mesh_measured" in result:
         value = number(result["mesh_measured"], 0, times=100.0, unit=" %")
         left_out = number(result.get("mesh_pieces_dropped"))
-        meaning = f"of the mesh’s area; the rest is predicted. Loose pieces left out: {left_out}"
+        meaning = (
+            "of the mesh’s area is surface that the camera measured; the rest is what the prior "
+            f"makes of it. Loose pieces left out: {left_out}"
+        )
         yield Figure("Measured", value, meaning)
     if "iou_composed" in result:
         before, after = (number(result.get(f"iou_{n}"), 3) for n in ("encoder", "refined"))

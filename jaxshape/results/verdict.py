@@ -162,15 +162,20 @@ def pieces(mesh: trimesh.Trimesh) -> int:
 
 # Words -----------------------------------------------------------------------------------------
 
-FAILED, DOUBTFUL = 0.5, 0.8
+# On the kitchen chair (every fourth frame), of the points explained and the area seen through:
+# as it is .93 and .01 with 3 keyframes, .80 and .03 with 8; a focal length 10 % too long .75 and
+# .30; a depth scale 25 % too large .93 and .33; poses in millimetres 1.0 and 0, for 6 of 7
+# keyframes hold nothing of the object.
+
+FAILED, DOUBTFUL = 0.5, 0.75
 """Share of the measured points below which a mesh failed to explain them, and is doubtful."""
 
 LITTLE_MEASURED = 0.12
 """Share of the area below which a mesh is more the prior's than the camera's."""
 
-SEEN_THROUGH = 0.1
-"""Share of the area which keyframes see through, from which a mesh is doubtful; three times that
-much, it failed."""
+SEEN_THROUGH, TORN = 0.1, 0.25
+"""Share of the area which keyframes see through, from which a mesh is doubtful, and failed: poses,
+camera or depth scale are wrong."""
 
 GAP = 0.05
 """Metres between the mesh and the floor from which a part of the object is missing or too much."""
@@ -194,7 +199,7 @@ def judged(quality: Quality) -> Verdict:
 def _failures(q: Quality) -> Iterator[str]:
     if q.explained < FAILED:
         yield f"the mesh explains only {q.explained:.0%} of what was measured of the object"
-    if q.free_violated > 3 * SEEN_THROUGH:
+    if q.free_violated > TORN:
         yield f"{q.free_violated:.0%} of the mesh lie where the camera saw through"
     if not SIZES[0] <= max(q.size) <= SIZES[1]:
         yield f"the object would be {max(q.size):.2g} m large"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from jaxshape.results.summary import verdict_in_words
 from jaxshape.results.verdict import (
     Quality,
     SeenView,
@@ -101,6 +102,17 @@ def test_keyframes_without_the_object_are_counted():
     views = [view(), view(taken=False), view()]
     found = quality_of(block(), None, views, axial=AXIAL)
     assert (found.keyframes, found.empty_keyframes) == (3, 1)
+
+
+def test_a_result_in_words():
+    result = {
+        "verdict": "doubtful",
+        "verdict_reasons": ["it leans", "it is thin"],
+        "quality": {"size": [0.5, 0.914, 0.48], "explained": 0.9},
+    }
+    said = "verdict: doubtful because it leans; it is thin. The object is 0.50 x 0.91 x 0.48 m."
+    assert verdict_in_words(result) == said
+    assert verdict_in_words({}) == ""
 
 
 def test_a_good_result_has_no_reasons():

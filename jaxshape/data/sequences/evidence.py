@@ -1,6 +1,6 @@
 """How well poses and depth images fit: do neighbouring frames see the same surface at one place?"""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from typing import NamedTuple
@@ -20,8 +20,9 @@ TOLERANCE = 0.02
 STRIDES = (1, 2, 4, 8, 16, 30, 60)
 """Frames between the two of a pair, of which the first is taken that tells."""
 
-MOVED = 0.5
-"""Agreement as if the camera had not moved, below which a pair tells something of the motion."""
+MOVED, HARDLY_MOVED = 0.5, 0.85
+"""Agreement as if the camera had not moved, below which a pair tells much of the motion; and
+below which pairs are taken where no pair of the recording tells much."""
 
 
 class Pair(NamedTuple):
@@ -68,12 +69,16 @@ def telling_pairs(sequence: Sequence, *, count: int = 8) -> tuple[Pair, ...]:
     """
     read = lru_cache(maxsize=2)(lambda index: _depth(sequence, index))
     firsts = np.unique(np.linspace(0, max(0, len(sequence) - 2), count, dtype=int))
-    pairs = (_first_telling(sequence, int(first), read) for first in firsts)
-    return tuple(pair for pair in pairs if pair is not None)
+    found = [_most_telling(sequence, int(first), read) for first in firsts]
+    clear = [pair for still, pair in filter(None, found) if still < MOVED]
+    return tuple(clear or [pair for _, pair in filter(None, found)])
 
 
-def _first_telling(sequence: Sequence, first: int, read) -> Pair | None:
-    a, pose_a = read(first), _pose(sequence, first)
+def _most_telling(
+    sequence: Sequence, first: int, read: Callable[[int], Float[np.ndarray, "h w"] | None]
+) -> tuple[float, Pair] | None:
+    """The nearest frame that tells much, or else that which tells most, and how little it moved."""
+    a, pose_a, best = read(first), _pose(sequence, first), None
     if a is None or pose_a is None:
         return None
     points = _points(a, sequence.intrinsics)
@@ -81,9 +86,12 @@ def _first_telling(sequence: Sequence, first: int, read) -> Pair | None:
         b, pose_b = read(second), _pose(sequence, second)
         if b is None or pose_b is None:
             continue
-        if _same_surface(points, b, sequence.intrinsics, np.eye(4), TOLERANCE) < MOVED:
-            return Pair(a, b, pose_a[0], pose_b[0], pose_a[1] or pose_b[1])
-    return None
+        still = _same_surface(points, b, sequence.intrinsics, np.eye(4), TOLERANCE)
+        if still < (HARDLY_MOVED if best is None else best[0]):
+            best = still, Pair(a, b, pose_a[0], pose_b[0], pose_a[1] or pose_b[1])
+        if still < MOVED:
+            break
+    return best
 
 
 def _depth(sequence: Sequence, index: int) -> Float[np.ndarray, "h w"] | None:
