@@ -108,7 +108,7 @@ def _ascii(body: bytes, counts: list[int], count: int) -> list[np.ndarray]:
 def _by_columns(content: bytes, row: np.dtype, count: int) -> list[np.ndarray]:
     """Fields that lie one behind the other, each of all points."""
     columns, start = [], 0
-    for i in range(len(row)):
+    for i in range(len(row.names or ())):
         field = row[i]
         columns.append(np.frombuffer(content, field, count, start))
         start += field.itemsize * count

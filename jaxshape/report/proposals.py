@@ -32,7 +32,7 @@ def write_proposals(
         color: Colour image `[h w 3]`; None for none.
         proposals: Pixels of each object `[h w]`.
     """
-    canvas = np.float64(_grey(depth) if color is None else color)
+    canvas = np.array(_grey(depth) if color is None else color, np.float64)
     for number, segmented in enumerate(proposals):
         tint = 255 * rgb(CYCLE[number % len(CYCLE)])
         canvas[segmented] = (1 - _TINT) * canvas[segmented] + _TINT * tint

@@ -64,6 +64,7 @@ def test_without_rays_nothing_is_free_and_units_are_brought_to_metres():
     assert occupied[:, :, 16].sum() > 300 and not free.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("up, front, unit", [("z", "x", 1.0), ("-y", "z", 1000.0)])
 def test_a_chair_is_placed_as_it_stands(up, front, unit):
     mesh = random_chair(3)
