@@ -62,7 +62,7 @@ class Complete(Rebuild):
             placed = place_cloud(cloud, prior, up=self.up, front=self.front, seed=self.seed)
         warnings = [*placed.warnings, *_of_rays(cloud)]
         for warning in warnings:
-            console.print(f"[yellow]warning[/] {escape(warning)}", highlight=False)
+            console.print(f"[yellow]warning[/] {escape(warning)}", highlight=False, soft_wrap=True)
         frame = place_of(placed.box, prior.resolution).frame
         grids = cloud_grids(cloud, placed, frame, prior.resolution, seed=self.seed)
         require_measured(np.asarray(grids.occupied))
