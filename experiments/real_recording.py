@@ -178,7 +178,7 @@ def _depth_agreement(progress: Progress, sequence: Sequence) -> dict[str, float]
     poses = trajectory(progress)
     ours, given = [], []
     for a, b in zip(keyframes, keyframes[1:], strict=False):
-        first, second = (prepare(sequence[i], sequence.intrinsics).view for i in (a, b))
+        first, second = (prepare(sequence[i]).view for i in (a, b))
         T_a, T_b = _given_pose(sequence, a), _given_pose(sequence, b)
         ours.append(_rmse(first, second, np.linalg.inv(poses[a]) @ poses[b]))
         given.append(_rmse(first, second, np.linalg.inv(T_a) @ T_b))

@@ -47,9 +47,9 @@ def look_from(eye, target=(0, 0.45, 0)) -> np.ndarray:
     return T
 
 
-def room(groups, eye=(0.9, 1.4, 1.8), *, noise=1.0, seed=0) -> Room:
+def room(groups, eye=(0.9, 1.4, 1.8), target=(0, 0.45, 0), *, noise=1.0, seed=0) -> Room:
     """A view of groups of boxes, each `(low, high)`, with the noise of a Kinect times `noise`."""
-    T = look_from(eye)
+    T = look_from(eye, target)
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T @ T[:3, :3].T
     depth, label = np.full(u.shape, np.inf), np.full(u.shape, -1)

@@ -18,7 +18,7 @@ from scene import write_scene
 
 from jaxshape import cli, process
 from jaxshape.cli.learning import preset_in
-from jaxshape.data import dataset, sequences
+from jaxshape.data import dataset
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.chairs import random_chair
@@ -36,7 +36,9 @@ from jaxshape.results.traces import read_search
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import families
 
-COMMANDS = ("demo", "dataset", "train", "reconstruct", "inspect", "evaluate", "plot", "view")
+COMMANDS = (
+    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view"
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -164,17 +166,30 @@ def test_a_recording_in_which_nothing_stands_out_is_refused(frames, refused, lin
     assert "Nothing but floor, walls and table tops is seen" in said
 
 
-def test_poses_that_are_missing_or_inverted_are_refused(frames, refused, linear, monkeypatch):
-    some = ("reconstruct", frames, "--box", frames / "box.json")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequences, "poses_look_inverted", lambda _: True)
-        for poses in ("auto", "given"):
-            said = refused(*some, "--poses", poses)
-            assert "look like world to camera" in said and "--poses none" in said
-    for path in frames.glob("*.pose.txt"):
+def test_poses_that_are_missing_or_do_not_fit_are_refused(frames, refused, linear):
+    some = ("reconstruct", *linear, frames, "--box", frames / "box.json")
+    paths = sorted(frames.glob("*.pose.txt"))
+    for number, path in enumerate(paths):
+        T = np.loadtxt(path)
+        T[1, 3] += 0.5 * number
+        np.savetxt(path, T)
+    said = refused(*some)
+    assert "agree with the depth images on" in said and "add --poses none to track" in said
+    for path in paths:
         path.unlink()
     for poses in ("given", "first"):
         assert f"--poses is {poses}, but" in refused(*some, "--poses", poses)
+
+
+def test_a_camera_that_is_a_guess_is_refused_unless_it_is_asked_for(tmp_path, refused, linear):
+    wall = np.full((48, 64), 1500, np.uint16)
+    (tmp_path / "scan/depth").mkdir(parents=True)
+    for number in range(2):
+        Image.fromarray(wall).save(tmp_path / f"scan/depth/{number}.png")
+    said = refused("reconstruct", *linear, tmp_path / "scan")
+    assert "holds no camera" in said and "--guess-camera" in said and "cam_K.txt" in said
+    said = refused("reconstruct", *linear, tmp_path / "scan", "--guess-camera")
+    assert "The object was not found" in said
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +376,9 @@ def test_reconstruct_writes_its_files(run, frames, tmp_path, linear):
     assert (result["iterations"], result["evaluations"]) == (2, 35)
     assert result["stop"] == "budget" and result["search"]["iterations"] == 2
     assert result["objective_refined"] <= result["objective_encoder"]
-    assert result["warnings"] == []
+    assert any("cannot be read as an image" in warning for warning in result["warnings"])
+    assert result["verdict"] in ("good", "doubtful") and f"verdict: {result['verdict']}" in out
+    assert result["quality"]["keyframes"] == 2 and len(result["quality"]["size"]) == 3
     assert "3 frames, 2 of them keyframes, 1 left out" in out
     assert "frame-000001: unreadable" in err and "cannot be read as an image" in err
     assert "objective:" in out and str(output) in out

@@ -2,12 +2,15 @@
 
 import json
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxshape import cli
+from jaxshape.cli.inspecting import LayoutName
+from jaxshape.data.sequences import LAYOUTS
 
 
 @pytest.fixture
@@ -49,7 +52,7 @@ def test_a_table_and_warnings(inspect, folder):
         "4, frame-0 to frame-4, 64 x 48 pixels",
         "fx 60.0, fy 60.0, cx 32.0, cy 24.0 (camera-intrinsics.txt)",
         "1000 units a metre: median 2.00 m; 0% invalid, 0% saturated (4 frames read)",
-        "4 of 4 frames, a way of 0.00 m; too little motion to tell their direction",
+        "4 of 4 frames, a way of 0.00 m; too little motion to tell whether they fit",
         "1 after frame-2",
         "warning missing frames: 1, the most (1) between frame-2 and frame-4. Tracking may",
     ):
@@ -62,7 +65,7 @@ def test_json_is_one_object_with_the_same_figures(inspect, folder):
     assert status == 0 and found["layout"] == "7-scenes" and found["frames"] == 4
     assert found["intrinsics"] == {"fx": 60, "fy": 60, "cx": 32, "cy": 24}
     assert found["gaps"] == [{"after": "frame-2", "before": "frame-4", "missing": 1}]
-    assert found["poses"]["agreement"]["pairs"] == 0 and found["rate"] is None
+    assert found["poses"]["pairs"] == 0 and found["rate"] is None
     (warning,) = found["warnings"]
     assert set(warning) == {"evidence", "advice"}
 
@@ -83,3 +86,7 @@ def test_what_cannot_be_read_is_refused(inspect, folder, tmp_path):
         path.write_bytes(b"")
     status, out, err = inspect(folder)
     assert status == 2 and not out and "cannot be read as an image" in err
+
+
+def test_every_layout_can_be_asked_for():
+    assert get_args(LayoutName) == tuple(LAYOUTS)

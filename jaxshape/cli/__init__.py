@@ -7,6 +7,7 @@ leaves earlier output as it was. JAX, and all that needs it, is imported inside 
 
     rebuild    demo
     recording  reconstruct
+    completing complete
     inspecting inspect
     learning   dataset, train
     scoring    evaluate, plot
@@ -23,6 +24,7 @@ from rich.markup import escape
 from tyro.conf import subcommand
 
 from jaxshape.cli.common import console
+from jaxshape.cli.completing import Complete
 from jaxshape.cli.inspecting import Inspect
 from jaxshape.cli.learning import BuildDataset, Train, preset_in
 from jaxshape.cli.options import RefusedSetting, refusing, reworded
@@ -45,6 +47,7 @@ def commands(arguments: Sequence[str]) -> Any:
         | Annotated[BuildDataset, subcommand("dataset", default=dataset)]
         | Annotated[Train, subcommand("train", default=train)]
         | Annotated[Reconstruct, subcommand("reconstruct")]
+        | Annotated[Complete, subcommand("complete")]
         | Annotated[Inspect, subcommand("inspect")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]

@@ -1,7 +1,7 @@
 """`jaxshape inspect`: what a recording holds, and what may be wrong with it."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,6 +9,36 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional
+
+LayoutName = Literal[
+    "7-scenes",
+    "tum",
+    "nerfstudio",
+    "bop",
+    "wildrgb-d",
+    "stray-scanner",
+    "record3d",
+    "scannet",
+    "replica",
+    "npz",
+    "redwood",
+    "bundlesdf",
+    "open3d",
+]
+"""Names of `jaxshape.data.sequences.LAYOUTS`."""
+
+ConventionName = Literal[
+    "as-given",
+    "wxyz",
+    "transposed",
+    "centimetres",
+    "millimetres",
+    "inverted",
+    "opengl",
+    "mirrored",
+    "ray",
+]
+"""Names of `jaxshape.data.sequences.conventions`, and that of none."""
 
 
 @dataclass(frozen=True)
@@ -19,12 +49,15 @@ class Inspect:
     """
 
     frames: Positional[Path]
-    """Folder of the recording: 7-Scenes, TUM RGB-D, Redwood, Open3D, or rgb/ depth/ masks/ with
-    cam_K.txt."""
+    """Folder of the recording: 7-Scenes, TUM RGB-D, ScanNet, BOP, WildRGB-D, Redwood, Replica,
+    Open3D, Stray Scanner, Record3D, nerfstudio, or rgb/ depth/ masks/ with cam_K.txt; or an .npz
+    file of arrays."""
     depth_scale: float | None = None
     """Depth units in a metre, above 0; those of the layout by default."""
-    layout: Literal["7-scenes", "tum", "redwood", "bundlesdf", "open3d"] | None = None
+    layout: LayoutName | None = None
     """Layout of the files; detected by default."""
+    convention: tuple[ConventionName, ...] = ()
+    """Conventions in which the recording is written, where it is not to be found out."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -33,18 +66,19 @@ class Inspect:
         from jaxshape.data.sequences.inspection import inspect_sequence
 
         sequence = open_sequence(self.frames, depth_scale=self.depth_scale, layout=self.layout)
-        found = inspect_sequence(sequence)
+        stated, keep_scale = self.convention or None, self.depth_scale is not None
+        found = inspect_sequence(sequence, stated, keep_scale=keep_scale)
         if self.json:
-            print(json.dumps(as_json(sequence, found), indent=1))
+            print(json.dumps(as_json(found), indent=1))
         else:
-            print_table(str(self.frames), sequence, found)
+            print_table(str(self.frames), found)
 
 
-def as_json(sequence: Any, found: Any) -> dict[str, Any]:
-    """All figures of a `Sequence` and its `Inspection`; lengths in metres, times in seconds."""
+def as_json(found: Any) -> dict[str, Any]:
+    """All figures of an `Inspection`; lengths in metres, times in seconds."""
     from jaxshape.data.sequences.cameras import intrinsic_numbers
 
-    times = sequence.times
+    sequence, times = found.sequence, found.sequence.times
     return {
         "layout": sequence.layout,
         "frames": len(sequence),
@@ -70,11 +104,19 @@ def as_json(sequence: Any, found: Any) -> dict[str, Any]:
 
 
 def _pose_figures(poses: Any) -> dict[str, Any]:
-    from jaxshape.data.sequences.evidence import looks_inverted
-
-    return poses._asdict() | {
-        "agreement": poses.agreement._asdict(),
-        "look_inverted": looks_inverted(poses.agreement),
+    reading = poses.reading
+    found = None
+    if reading.best is not None:
+        found = asdict(reading.best.convention) | {"share": reading.best.share}
+        found |= {"used": poses.is_used}
+    return {
+        "known": poses.known,
+        "length": poses.length,
+        "agreement": poses.agreement,
+        "agreement_as_written": reading.given,
+        "pairs": reading.pairs,
+        "convention": found,
+        "damaged": poses.damaged,
     }
 
 
@@ -87,16 +129,15 @@ def _color_delay(sequence: Any) -> dict[str, float] | None:
     return {"median": float(np.median(known)), "max": float(max(known))} if known else None
 
 
-def print_table(title: str, sequence: Any, found: Any) -> None:
+def print_table(title: str, found: Any) -> None:
     """The figures as a table, then each warning as a sentence and what to do."""
     console = Console()
     table = Table(title=escape(title), show_header=False, title_justify="left")
-    for row in _rows(as_json(sequence, found)):
+    for row in _rows(as_json(found)):
         table.add_row(*map(escape, row))
     console.print(table)
-    for evidence, advice in found.warnings:
-        sentence = evidence.rstrip(".")
-        console.print(f"[yellow]warning[/] {escape(f'{sentence}. {advice}')}", soft_wrap=True)
+    for warning in found.warnings:
+        console.print(f"[yellow]warning[/] {escape(warning.sentence)}", soft_wrap=True)
 
 
 def _rows(figures: dict[str, Any]) -> list[tuple[str, str]]:
@@ -140,15 +181,13 @@ def _gap_row(gaps: list[dict[str, Any]]) -> str:
 def _pose_row(poses: dict[str, Any] | None, count: int) -> str:
     if poses is None:
         return "none: the camera has to be tracked"
-    given, inverted, pairs = poses["agreement"].values()
     row = f"{poses['known']} of {count} frames, a way of {poses['length']:.2f} m; "
-    if not pairs:
-        return row + "too little motion to tell their direction"
-    direction = "world to camera" if poses["look_inverted"] else "camera to world"
-    return row + (
-        f"{direction}: {given:.0%} of the pixels of {pairs} pairs of frames agree, "
-        f"{inverted:.0%} if inverted"
-    )
+    if not poses["pairs"]:
+        return row + "too little motion to tell whether they fit"
+    row += f"{poses['agreement']:.0%} of the pixels of {poses['pairs']} pairs of frames agree"
+    if poses["convention"] is not None and poses["convention"]["used"]:
+        row += f", {poses['agreement_as_written']:.0%} as written"
+    return row
 
 
 def _color_row(figures: dict[str, Any], count: int) -> str:

@@ -1,14 +1,17 @@
 """`jaxshape reconstruct`: one object from a recording."""
 
+import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from rich.markup import escape
 from tyro.conf import Positional
 
 from jaxshape.cli.common import console, progress_bar, require
+from jaxshape.cli.inspecting import ConventionName
 from jaxshape.cli.rebuild import Rebuild, report_objective
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 
@@ -20,12 +23,15 @@ class Reconstruct(Rebuild):
     The object is found by itself where it is alone and central, or by a click, a region, a depth
     range, masks beside the images, or its box. Poses are used where they are given. A run that was
     killed goes on when the same command is given again; `jaxshape view` shows it while it runs.
+    The last lines say how far the result can be believed; the exit status is 3 where it cannot.
 
     Examples: jaxshape reconstruct scan/
 
     jaxshape reconstruct scan/ --click 320 240 --poses none
 
     jaxshape reconstruct scan/ --box box.json --every 5
+
+    jaxshape reconstruct scan/ --list, then jaxshape reconstruct scan/ --object 2
     """
 
     frames: Positional[Path]
@@ -36,6 +42,10 @@ class Reconstruct(Rebuild):
     """Left, top, right and bottom of a part of the first frame that holds the object alone."""
     depth_range: tuple[float, float] | None = None
     """Nearest and farthest depth of the object in the first frame, in metres."""
+    list_objects: Annotated[bool, tyro.conf.arg(name="list")] = False
+    """Number the objects that the first frame shows in objects.png, and do nothing else."""
+    object: int | None = None
+    """Number of the object, as --list shows them."""
     box: Path | None = None
     """JSON file with the object's box: {"T_world_object": 4x4, "size": [x, y, z]}. The object
     frame has +y up and its front along +z; the world is that of the poses or, without poses, the
@@ -47,7 +57,11 @@ class Reconstruct(Rebuild):
     every: int = 1
     """Use every n-th frame, n being 1 or more."""
     depth_scale: float | None = None
-    """Depth units in a metre, above 0; those of the layout by default."""
+    """Depth units in a metre, above 0; found out by default, or those of the layout."""
+    convention: tuple[ConventionName, ...] = ()
+    """Conventions in which poses and depth are written; found out by default."""
+    guess_camera: bool = False
+    """Take the usual camera of such recordings where the folder holds none."""
     tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
     mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
     fresh: bool = False
@@ -78,14 +92,19 @@ class Reconstruct(Rebuild):
         require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")
         prior, refiner, search = self.prepare()
         sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
+        with console.status("inspecting the recording"):
+            inspected = self._inspected(sequence)
+        sequence = inspected.sequence
         require(
             self.first < len(sequence),
             f"--first is {self.first}, but there are {len(sequence)} frames, counted from 0.",
         )
-        prompt = Prompt(self.click, self.region, self.depth_range)
+        if self.list_objects:
+            return self._list_objects(sequence)
+        prompt = Prompt(self.click, self.region, self.depth_range, self.object)
         check_prompt(prompt, sequence.shape)
         box = read_box(self.box) if self.box else None
-        use_poses = self._use_poses(sequence)
+        use_poses = self._use_poses(inspected)
         mapper = build_mapper(prior, refiner, search, self.mapping, self.tracking, seed=self.seed)
         figures: dict[str, Any] = {
             "object": str(self.frames),
@@ -98,8 +117,12 @@ class Reconstruct(Rebuild):
             "poses": self.poses,
             "frames": [self.first, self.every, len(sequence)],
             "depth_scale": sequence.depth_scale,
+            "convention": self.convention,
             "prior": fingerprint(prior),
         }
+        figures["warnings"] = [warning.sentence for warning in inspected.warnings]
+        for warning in figures["warnings"]:
+            console.print(f"[yellow]warning[/] {escape(warning)}", highlight=False, soft_wrap=True)
         earlier = None
         if not self.fresh:
             earlier = load_state(self.output, sequence, prior, settings, self.mapping)
@@ -150,22 +173,58 @@ class Reconstruct(Rebuild):
         result = write_progress(self.output, sequence, progress, figures, running=False)
         self._conclude(progress, result)
         remove_state(self.output)
+        if result["verdict"] == "failed":
+            sys.exit(3)
 
-    def _use_poses(self, sequence: Any) -> bool:
+    def _inspected(self, sequence: Any) -> Any:
+        """The recording as it is to be read, and what was noticed; refuses a guessed camera."""
+        from jaxshape.data.sequences.inspection import inspect_sequence
+
+        require(
+            self.guess_camera or not sequence.camera_is_guess,
+            f"{str(self.frames)!r} holds no camera, and a focal length that is wrong by 5 % bends "
+            "the surface: write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt there, or add "
+            f"--guess-camera to take that of {sequence.camera}.",
+        )
+        stated, keep_scale = self.convention or None, self.depth_scale is not None
+        return inspect_sequence(sequence, stated, keep_scale=keep_scale)
+
+    def _list_objects(self, sequence: Any) -> None:
+        """Write a picture of what the first frame shows, and the size of each object."""
+        from jaxshape.mapping.placement.finding import first_readable
+        from jaxshape.mapping.segmentation.proposals import propose
+        from jaxshape.report.proposals import write_proposals
+
+        use_pose = self.poses != "none" and sequence.has_poses
+        _, frame = first_readable(sequence, self.first, use_pose)
+        found = propose(frame.depth, frame.intrinsics)
+        require(bool(found), f"{frame.name} shows floor and walls alone; give another --first.")
+        picture = self.output / "objects.png"
+        write_proposals(picture, frame.depth, frame.color, [one.segmented for one in found])
+        for number, one in enumerate(found, 1):
+            size = " x ".join(f"{extent:.2f}" for extent in one.size)
+            print(f"{number}: {size} m (width, height, depth), {one.distance:.2f} m away")
+        print(f"wrote {picture} of {frame.name}; take one with --object and its number")
+
+    def _use_poses(self, inspected: Any) -> bool:
         """Whether all given poses are used; refuses options that contradict the recording."""
-        from jaxshape.data.sequences import poses_look_inverted
+        from jaxshape.data.sequences.inspection import BADLY
 
+        has_poses, poses = inspected.sequence.has_poses, inspected.poses
         if self.poses in ("given", "first"):
             require(
-                sequence.has_poses,
+                has_poses,
                 f"--poses is {self.poses}, but {str(self.frames)!r} has none; leave it out.",
             )
-        if self.poses in ("none", "first") or not sequence.has_poses:
+        if self.poses in ("none", "first") or not has_poses:
             return False
+        best = poses.reading.best
+        hint = "" if best is None else f"{best.convention.options} would make it {best.share:.0%}; "
         require(
-            not poses_look_inverted(sequence),
-            f"The poses in {str(self.frames)!r} look like world to camera: the frames agree better "
-            "when each is inverted. Write camera to world, or add --poses none to track instead.",
+            poses.reading.pairs == 0 or poses.agreement >= BADLY,
+            f"The poses in {str(self.frames)!r} agree with the depth images on "
+            f"{poses.agreement:.0%} of the pixels only, and would tear the surface: {hint}"
+            "state how they are written with --convention, or add --poses none to track instead.",
         )
         return True
 
@@ -174,6 +233,7 @@ class Reconstruct(Rebuild):
         from jaxshape.report.page import write_report
         from jaxshape.report.panels import write_overview
         from jaxshape.results.progress import observation_of
+        from jaxshape.results.summary import verdict_in_words
 
         observation = observation_of(progress.state)
         with console.status("drawing"):
@@ -187,6 +247,7 @@ class Reconstruct(Rebuild):
             if log.status in ("lost", "unreadable"):
                 console.print(f"{log.name}: {log.status}, {log.reason}", highlight=False)
         report_objective(result)
+        print(verdict_in_words(result))
         print(f"wrote mesh.glb, trajectory.txt, result.json, report.html and more to {self.output}")
 
 

@@ -22,7 +22,7 @@ from jaxshape.data.orientation import apparent_up
 
 __all__ = [
     "MeshSource", "Model", "Skipped", "axes_to_canonical", "canonical", "list_meshes", "load",
-    "lying_on_its_side", "read_meshes", "sample_surface",
+    "lying_on_its_side", "read_meshes", "sample_oriented", "sample_surface",
 ]  # fmt: skip
 
 MAX_FACES = 20_000_000
@@ -246,6 +246,19 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.nda
         count: Number of points.
         seed: Seed of the points.
     """
+    return sample_oriented(mesh, count, seed)[0]
+
+
+def sample_oriented(
+    mesh: trimesh.Trimesh, count: int, seed: int
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """The points of `sample_surface`, and the normals of their triangles, of length 1.
+
+    Args:
+        mesh: The mesh.
+        count: Number of points.
+        seed: Seed of the points.
+    """
     random = np.random.default_rng(seed)
     area = np.cumsum(trimesh.triangles.area(mesh.triangles))
     position = (np.arange(count) + random.random(count)) / count * area[-1]
@@ -253,7 +266,9 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.nda
     # the square root makes points uniform over a triangle with corners a, b, c
     s, t = np.sqrt(random.random(count))[:, None], random.random(count)[:, None]
     a, b, c = np.moveaxis(mesh.triangles[face], 1, 0)
-    return (1 - s) * a + s * (1 - t) * b + s * t * c
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return (1 - s) * a + s * (1 - t) * b + s * t * c, normals
 
 
 def lying_on_its_side(mesh: trimesh.Trimesh) -> bool:

@@ -17,6 +17,7 @@ from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.files import atomic_path
 from jaxshape.mapping.config import MappingConfig
+from jaxshape.mapping.map.cutting import parts_in
 from jaxshape.mapping.map.recording import FrameLog, Progress
 from jaxshape.mapping.map.state import MapState, assemble
 from jaxshape.mapping.placement.finding import Start, room
@@ -152,7 +153,8 @@ def _state(
     keyframes: list[Keyframe] = []
     view = None
     for number, index in enumerate(indices):
-        prepared = prepare(sequence[index], sequence.intrinsics)
+        frame = sequence[index]
+        prepared = prepare(frame)
         view = prepared.view
         masked, segmented = (
             jnp.asarray(np.unpackbits(packed, axis=-1, count=view.depth.shape[1]).astype(bool))
@@ -165,6 +167,8 @@ def _state(
         information = jnp.asarray(kept["keyframes.information"][number])
         odometry = T_previous, information
         prepared = prepared._replace(masked=masked)
+        if start.T_level_world is not None and frame.mask is None:
+            prepared = prepared._replace(parts=parts_in(prepared, first=number == 0))
         keyframes.append(keyframe_of(prepared, place, T, odometry, segmented))
     assert view is not None
     return assemble(

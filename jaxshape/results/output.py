@@ -19,6 +19,7 @@ from jaxshape.results.coloring import ColorView, color_vertices
 from jaxshape.results.fused_surface import fuse_surface
 from jaxshape.results.surface import surface, write_mesh
 from jaxshape.results.traces import write_trace
+from jaxshape.results.verdict import SeenView, judged, quality_of
 from jaxshape.search.reconstruction import Reconstruction
 from jaxshape.search.refiner import StopReason
 
@@ -44,6 +45,8 @@ class Observation(NamedTuple):
             None makes the mesh from the composed grid.
         views: Frames that give the mesh its colours, gone through once; none leave it without.
         sensor: How the noise of depth grows.
+        keyframes: The keyframes that the mesh is judged by; none leave it unjudged.
+        floor: Height of the floor in the object frame, in metres; NaN where it is not known.
     """
 
     depth: Sequence[Float[np.ndarray, "_ _"]]
@@ -55,6 +58,8 @@ class Observation(NamedTuple):
     field: DistanceField | None = None
     views: Iterable[ColorView] = ()
     sensor: Sensor = Sensor()
+    keyframes: Sequence[SeenView] = ()
+    floor: float = np.nan
 
 
 def write_result(
@@ -110,7 +115,10 @@ def write_shape(
         (folder / "trace.npz").unlink(missing_ok=True)  # of an earlier search
     else:
         write_trace(folder / "trace.npz", jax.tree.map(lambda x: x[: one.iterations], one.trace))
-    return {**figures, **_searched(one), **_of_mesh(found), **_measured(observation, one)}
+    told = {**figures, **_searched(one), **_of_mesh(found), **_measured(observation, one)}
+    return (
+        told | _judged(observation, found, bool(one.symmetric)) if observation.keyframes else told
+    )
 
 
 class ShapeMesh(NamedTuple):
@@ -162,6 +170,32 @@ def _of_mesh(found: ShapeMesh) -> dict[str, Any]:
     area = found.mesh.area_faces
     share = found.measured[found.mesh.faces].mean(axis=1) @ area / area.sum()
     return {"mesh_measured": round(float(share), 4), "mesh_pieces_dropped": found.dropped}
+
+
+def _judged(observation: Observation, found: ShapeMesh, is_mirrored: bool) -> dict[str, Any]:
+    quality = quality_of(
+        found.mesh,
+        found.measured,
+        observation.keyframes,
+        axial=observation.sensor.axial,
+        is_mirrored=is_mirrored,
+        floor=observation.floor,
+    )
+    verdict = judged(quality)
+    return {
+        "verdict": verdict.word,
+        "verdict_reasons": list(verdict.reasons),
+        "quality": {name: _rounded(value) for name, value in quality._asdict().items()},
+    }
+
+
+def _rounded(value: Any) -> Any:
+    """A figure as JSON holds it: four digits, None for NaN."""
+    if isinstance(value, tuple):
+        return [_rounded(one) for one in value]
+    if not isinstance(value, float):
+        return value
+    return round(value, 4) if np.isfinite(value) else None
 
 
 def only(reconstruction: Reconstruction) -> Any:

@@ -18,14 +18,18 @@ import numpy as np
 from PIL import Image
 
 from jaxshape.data.sequences import Sequence, Trajectory, write_trajectory
+from jaxshape.data.sequences.cameras import intrinsic_numbers
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grids import binary
+from jaxshape.mapping.map.doubts import doubts_of
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.map.state import MapState, grids_of
+from jaxshape.mapping.placement.finding import Start
 from jaxshape.mapping.tracking.keyframes import Keyframe
 from jaxshape.results.coloring import ColorView
 from jaxshape.results.output import Observation, write_shape
+from jaxshape.results.verdict import SeenView
 
 FRAMES_TO_SHOW = 6
 
@@ -56,7 +60,11 @@ def write_progress(
     if observation.field is not None:
         observation = observation._replace(views=color_views(sequence, progress))
     start = progress.start
-    result = {**figures, **counts(progress), "notes": start.notes, "warnings": start.warnings}
+    if not running:
+        keyframes, floor = seen_views(progress.state), floor_height(start)
+        observation = observation._replace(keyframes=keyframes, floor=floor)
+    warnings = [*figures.get("warnings", ()), *start.warnings, *doubts_of(progress)]
+    result = {**figures, **counts(progress), "notes": start.notes, "warnings": warnings}
     result["box"] = {
         "T_world_object": start.box.T_world_object.tolist(),
         "size": start.box.size.tolist(),
@@ -87,16 +95,35 @@ def observation_of(state: MapState) -> Observation:
     )
 
 
+def seen_views(state: MapState) -> tuple[SeenView, ...]:
+    """The keyframes of a map, as a mesh in the object frame is compared with them."""
+    T_object_world = np.linalg.inv(state.place.box.T_world_object)
+
+    def seen(one: Keyframe) -> SeenView:
+        fx, fy, cx, cy = map(float, one.intrinsics)
+        T_object_camera = T_object_world @ np.asarray(one.T_world_camera.as_matrix(), np.float64)
+        depth, segmented = np.asarray(one.depth), np.asarray(one.segmented)
+        return SeenView(depth, segmented, (fx, fy, cx, cy), T_object_camera)
+
+    return tuple(map(seen, state.keyframes))
+
+
+def floor_height(start: Start) -> float:
+    """y of the floor in the object frame, which stands upright on it; NaN where it is not known."""
+    if start.T_level_world is None:
+        return np.nan
+    return start.floor - float((start.T_level_world @ start.box.T_world_object)[1, 3])
+
+
 def color_views(sequence: Sequence, progress: Progress) -> Iterator[ColorView]:
     """The keyframes that have colours, at their present poses, read one after the other."""
     T_object_world = np.linalg.inv(progress.state.place.box.T_world_object)
-    K = sequence.intrinsics
-    intrinsics = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     for log, keyframe in _fused(progress):
         frame = sequence[log.index]
         if frame.color is not None:
             T_world_camera = np.asarray(keyframe.T_world_camera.as_matrix(), np.float64)
-            yield ColorView(frame.color, frame.depth, intrinsics, T_object_world @ T_world_camera)
+            camera = intrinsic_numbers(frame.intrinsics)
+            yield ColorView(frame.color, frame.depth, camera, T_object_world @ T_world_camera)
 
 
 def counts(progress: Progress) -> dict[str, int]:
@@ -107,7 +134,7 @@ def counts(progress: Progress) -> dict[str, int]:
         "frames_tracked": statuses.count("tracked") + statuses.count("keyframe"),
         "frames_lost": statuses.count("lost"),
         "frames_unreadable": statuses.count("unreadable"),
-        "keyframes": len(progress.state.keyframes),
+        "keyframes": sum(1 for _ in _fused(progress)),
     }
 
 
@@ -124,9 +151,8 @@ def _crop(depth: np.ndarray, segmented: np.ndarray) -> np.ndarray:
 
 
 def _fused(progress: Progress) -> Iterator[tuple[FrameLog, Keyframe]]:
-    """The log of each keyframe, and the keyframe as the map keeps it."""
-    logs = (log for log in progress.logs if log.status == "keyframe")
-    return zip(logs, progress.state.keyframes, strict=True)
+    """The keyframes that show the object."""
+    return (pair for pair in progress.of_keyframes() if np.asarray(pair[1].segmented).any())
 
 
 def _write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> None:
@@ -169,8 +195,17 @@ def _keyframes(sequence: Sequence, progress: Progress) -> dict[str, Any]:
             }
             for log, keyframe in _fused(progress)
         ],
-        "frames": [_frame_entry(log, poses) for log in progress.logs],
+        "frames": [_frame_entry(log, poses) for log in _as_fused(progress)],
     }  # fmt: skip
+
+
+def _as_fused(progress: Progress) -> Iterator[FrameLog]:
+    """The logs of all frames; a keyframe without the object is one that was tracked."""
+    fused = {log.index for log, _ in _fused(progress)}
+    reason = "no pixel was taken for the object"
+    for log in progress.logs:
+        is_empty = log.status == "keyframe" and log.index not in fused
+        yield log._replace(status="tracked", reason=reason) if is_empty else log
 
 
 def _frame_entry(log: FrameLog, poses: dict[int, np.ndarray]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ class Figure(NamedTuple):
 def headline(found: ResultFolder) -> Iterator[Figure]:
     """The figures that matter most, as far as they are known."""
     result, counts = found.result, _counts(found)
+    yield from _judgement(result)
     if found.frames:
         others = [f"{n} {status}" for status, n in counts.items() if status != "keyframe"]
         value = f"{counts['keyframe']} of {len(found.frames)}"
@@ -34,14 +35,18 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
     if "objective_refined" in result:
         before, after = (number(result.get(f"objective_{n}"), 4) for n in ("encoder", "refined"))
         meaning = (
-            f"nats per voxel of the whole grid ({_minimised(result)}), of the encoder’s code, then "
-            "of the refined one; lower is better"
+            "how far the shape and the measurement disagree, before and after the search; lower is "
+            "better, and it only compares searches on the same frames: nats per voxel of the whole "
+            f"grid ({_minimised(result)})"
         )
         yield Figure("Objective", f"{before} → {after}", meaning)
     if "mesh_measured" in result:
         value = number(result["mesh_measured"], 0, times=100.0, unit=" %")
         left_out = number(result.get("mesh_pieces_dropped"))
-        meaning = f"of the mesh’s area; the rest is predicted. Loose pieces left out: {left_out}"
+        meaning = (
+            "of the mesh’s area is surface that the camera measured; the rest is what the prior "
+            f"makes of it. Loose pieces left out: {left_out}"
+        )
         yield Figure("Measured", value, meaning)
     if "iou_composed" in result:
         before, after = (number(result.get(f"iou_{n}"), 3) for n in ("encoder", "refined"))
@@ -52,6 +57,43 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
         yield Figure("IoU with the truth", number(result["iou_composed"], 3), meaning)
     if "seconds" in result:
         yield Figure("Time", number(result["seconds"], 1, unit=" s"), "from start to result")
+
+
+def verdict_in_words(result: dict[str, Any]) -> str:
+    """The verdict of a result as a sentence, with the object's size; empty without one."""
+    if "verdict" not in result:
+        return ""
+    reasons = "; ".join(map(str, result.get("verdict_reasons") or ()))
+    because = f" because {reasons}" if reasons else ""
+    return f"verdict: {result['verdict']}{because}. The object is {_size(result)}."
+
+
+def _judgement(result: dict[str, Any]) -> Iterator[Figure]:
+    """The verdict and the figures it rests on, in plain words."""
+    quality = result.get("quality")
+    if "verdict" not in result or not isinstance(quality, dict):
+        return
+    reasons = "; ".join(map(str, result.get("verdict_reasons") or ()))
+    yield Figure("Verdict", str(result["verdict"]), reasons or "nothing speaks against the result")
+    yield Figure("Size", _size(result), "width, height and depth of the object")
+    percent = {"times": 100.0, "unit": " %"}
+    parts = [
+        f"{number(quality.get(name), **percent)} {name}"
+        for name in ("measured", "mirrored", "predicted")
+        if quality.get(name) is not None
+    ]
+    meaning = (
+        "of what the camera measured of the object lies within 1 cm of the mesh, give or take the "
+        f"camera’s noise. The mesh: {', '.join(parts) or 'not known what was measured'}; "
+        f"{number(quality.get('free_violated'), **percent)} lie where the camera saw through"
+    )
+    yield Figure("Explained", number(quality.get("explained"), **percent), meaning)
+
+
+def _size(result: dict[str, Any]) -> str:
+    """Width, height and depth in metres."""
+    sides = (result.get("quality") or {}).get("size") or ()
+    return " x ".join(number(side, 2) for side in sides) + " m"
 
 
 def warnings_of(found: ResultFolder) -> list[str]:

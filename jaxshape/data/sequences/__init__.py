@@ -2,10 +2,11 @@
 
 A layout is two functions: whether a folder `fits` it, and one that lists the files of each frame.
 Images are read, and checked, one frame at a time when asked for, so a long sequence never fills the
-memory. Rooms, in the order of data: `frames` (what is read), `poses`, `trajectories`, `cameras`,
-`listing` (which images belong together), `seven_scenes`, `tum`, `folders` (the layouts), `evidence`
-(do the poses fit the images?), `figures` and `inspection` (what to know of a recording, and what to
-doubt).
+memory. Rooms, in the order of data: `frames` (what is read), `text`, `poses`, `trajectories`,
+`cameras`, `listing` (which images belong together), `seven_scenes`, `tum`, `folders` (the layouts),
+`unread` (files without use), `conventions` (how others write poses and depth), `evidence` (do the
+poses fit the images?), `hypotheses` (in which convention do they?), `figures` and `inspection`
+(what to know of a recording, and what to doubt).
 
 Depth images and colour images are taken as registered: of one camera, as all these layouts promise.
 A colour image of another size but the same aspect is scaled to the depth image.
@@ -17,11 +18,29 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxshape.data.sequences import folders, seven_scenes, tum
-from jaxshape.data.sequences.cameras import Camera, default_camera, find_camera, guessed
-from jaxshape.data.sequences.evidence import PoseAgreement as PoseAgreement
-from jaxshape.data.sequences.evidence import pose_agreement as pose_agreement
-from jaxshape.data.sequences.evidence import poses_look_inverted as poses_look_inverted
+import numpy as np
+from jaxtyping import Float
+
+from jaxshape.data.sequences import (
+    arrays,
+    bop,
+    folders,
+    nerfstudio,
+    record3d,
+    replica,
+    scannet,
+    seven_scenes,
+    stray_scanner,
+    tum,
+    wild_rgbd,
+)
+from jaxshape.data.sequences.cameras import (
+    Camera,
+    default_camera,
+    find_camera,
+    guessed,
+    scaled_cameras,
+)
 from jaxshape.data.sequences.frames import Finding as Finding
 from jaxshape.data.sequences.frames import Frame as Frame
 from jaxshape.data.sequences.frames import FrameFiles as FrameFiles
@@ -35,6 +54,7 @@ from jaxshape.data.sequences.trajectories import Pinhole as Pinhole
 from jaxshape.data.sequences.trajectories import Trajectory as Trajectory
 from jaxshape.data.sequences.trajectories import read_trajectory as read_trajectory
 from jaxshape.data.sequences.trajectories import write_trajectory as write_trajectory
+from jaxshape.data.sequences.unread import unread
 
 
 class Layout(NamedTuple):
@@ -54,11 +74,26 @@ class Layout(NamedTuple):
 LAYOUTS: dict[str, Layout] = {
     "7-scenes": Layout("frame-N.depth.png", seven_scenes.fits, seven_scenes.list_frames),
     "tum": Layout("depth.txt (lines of `time file`)", tum.fits, tum.list_frames),
+    "nerfstudio": Layout("transforms.json", nerfstudio.fits, nerfstudio.list_frames),
+    "bop": Layout("depth/*.png, scene_camera.json", bop.fits, bop.list_frames),
+    "wildrgb-d": Layout("depth/*.png, cam_poses.txt", wild_rgbd.fits, wild_rgbd.list_frames),
+    "stray-scanner": Layout(
+        "depth/*.png, odometry.csv", stray_scanner.fits, stray_scanner.list_frames
+    ),
+    "record3d": Layout("depth/*.exr, metadata.json", record3d.fits, record3d.list_frames),
+    "scannet": Layout(
+        "depth/*.png, intrinsic/intrinsic_depth.txt", scannet.fits, scannet.list_frames
+    ),
+    "replica": Layout("results/depth*.png, traj.txt", replica.fits, replica.list_frames),
+    "npz": Layout("one .npz with depth, K", arrays.fits, arrays.list_frames),
     "redwood": Layout("depth/N-TIME.png", folders.fits_redwood, folders.list_redwood),
     "bundlesdf": Layout("depth/*.png, cam_K.txt", folders.fits_bundlesdf, folders.list_bundlesdf),
     "open3d": Layout("depth/*.png", folders.fits_open3d, folders.list_open3d),
 }
 """Layouts in the order in which they are tried: the last fits any folder with depth images."""
+
+FILES = (".npz", ".r3d")
+"""Ends of the files that can be a recording by themselves."""
 
 
 def open_sequence(
@@ -70,10 +105,9 @@ def open_sequence(
     that such recordings are made with is taken, and `findings` say so if that is a guess.
 
     Args:
-        path: Folder of the recording.
+        path: Folder of the recording, or an `.npz` file of arrays.
         depth_scale: Depth units in a metre, above 0; None for those of the layout.
-        layout: Name of the layout: `7-scenes`, `tum`, `redwood`, `bundlesdf` or `open3d`; None for
-            the first that fits.
+        layout: Name of the layout, a key of `LAYOUTS`; None for the first that fits.
 
     Returns:
         The recording: `len`, indexing and iteration read one frame at a time.
@@ -86,16 +120,17 @@ def open_sequence(
             f"The depth scale is {depth_scale}; expected the number of depth units in a metre, "
             "which is positive: 1000 for millimetres."
         )
-    folder = Path(path)
-    if not folder.is_dir():
-        raise SequenceError(f"{folder} is not a folder; give the one that holds the recording.")
-    contents = list_folder(folder)
+    contents = _contents_of(Path(path))
     name = _layout_of(contents) if layout is None else _checked_layout(layout)
     listed = LAYOUTS[name].list_frames(contents)
     if not listed.files:
         raise SequenceError(_nothing_fits(contents))
     shape = _shape_of(listed)
-    camera, doubts = _camera(contents, listed, shape)
+    camera, cameras, doubts = _cameras(contents, listed, shape)
+    has_poses, is_guess = listed.read_pose is not None, bool(doubts)
+    doubts += tuple(
+        unread(contents, has_poses=has_poses, has_camera=not is_guess, told=listed.findings)
+    )
     files, remarks = _without_other_colors(listed, shape)
     return Sequence(
         layout=name,
@@ -103,13 +138,24 @@ def open_sequence(
         camera=camera.source,
         files=files,
         read_pose=listed.read_pose or _no_pose,
-        has_poses=listed.read_pose is not None,
+        has_poses=has_poses,
         shape=shape,
         depth_scale=float(depth_scale or listed.depth_scale),
         times=listed.times,
         color_delays=listed.color_delays,
         findings=listed.findings + doubts + remarks,
+        cameras=cameras,
+        camera_is_guess=is_guess,
     )
+
+
+def _contents_of(path: Path) -> Contents:
+    """What lies in a folder, or the one file that a recording can be."""
+    if path.suffix.lower() in FILES and path.is_file():
+        return Contents(path.parent, frozenset({path.name}), frozenset())
+    if not path.is_dir():
+        raise SequenceError(f"{path} is not a folder; give the one that holds the recording.")
+    return list_folder(path)
 
 
 def _no_pose(index: int) -> None:
@@ -174,6 +220,18 @@ def _shape_of(listed: Listed) -> tuple[int, int]:
         with suppress(SequenceError):
             return read_shape(files.depth)
     return read_shape(listed.files[0].depth)  # raises what is wrong with it
+
+
+def _cameras(
+    contents: Contents, listed: Listed, shape: tuple[int, int]
+) -> tuple[Camera, Float[np.ndarray, "n 3 3"] | None, tuple[Finding, ...]]:
+    """The camera of the first frame, those of all where they differ, and what is doubtful."""
+    if listed.calibration is None:
+        camera, doubts = _camera(contents, listed, shape)
+        return camera, None, doubts
+    cameras = scaled_cameras(listed.calibration, shape)
+    camera = Camera(cameras[0], listed.calibration.source)
+    return camera, cameras if len(cameras) > 1 else None, ()
 
 
 def _camera(

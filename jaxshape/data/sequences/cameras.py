@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxshape.data.sequences.frames import Finding, SequenceError, same_aspect, size
 from jaxshape.data.sequences.poses import read_matrix
+from jaxshape.data.sequences.text import read_text, words_of
 
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -29,6 +30,22 @@ class Camera(NamedTuple):
     """
 
     intrinsics: Float[np.ndarray, "3 3"]
+    source: str
+
+
+class Calibration(NamedTuple):
+    """Cameras that a recording's own files give, of images of some size.
+
+    Attributes:
+        matrices: Camera matrix of each frame, or one of all `[n 3 3]`, in pixels, where column j
+            covers u in [j, j + 1).
+        shape: Height and width of the images they are of, in pixels; None for those of the depth
+            images.
+        source: Where the cameras come from.
+    """
+
+    matrices: Float[np.ndarray, "n 3 3"]
+    shape: tuple[int, int] | None
     source: str
 
 
@@ -71,6 +88,28 @@ def find_camera(folder: Path, names: Iterable[str], shape: tuple[int, int]) -> C
 
 def _camera(K: Matrix, path: Path, shape: tuple[int, int]) -> Camera:
     return Camera(_checked(K, path, shape), path.name)
+
+
+def scaled_cameras(calibration: Calibration, shape: tuple[int, int]) -> Float[np.ndarray, "n 3 3"]:
+    """The cameras of a calibration, for images of `shape`; `SequenceError` if they are not."""
+    height, width = calibration.shape or shape
+    if not (height > 0 and width > 0 and same_aspect((height, width), shape)):
+        raise SequenceError(
+            f"{calibration.source} is of images of {size((height, width))} pixels, and the depth "
+            f"images are {size(shape)}; expected the camera of the depth images: write theirs to "
+            "cam_K.txt, and remove it."
+        )
+    scaled = np.diag([shape[1] / width, shape[0] / height, 1.0]) @ calibration.matrices
+    return np.stack([_checked(K, calibration.source, shape) for K in scaled])
+
+
+def matrices_of(fx: Any, fy: Any, cx: Any, cy: Any) -> Float[np.ndarray, "n 3 3"]:
+    """Camera matrices from their numbers, each one number or one of each frame."""
+    fx, fy, cx, cy = np.broadcast_arrays(*(np.atleast_1d(one) for one in (fx, fy, cx, cy)))
+    matrices = np.tile(np.eye(3), (len(fx), 1, 1))
+    matrices[:, 0, 0], matrices[:, 1, 1] = fx, fy
+    matrices[:, 0, 2], matrices[:, 1, 2] = cx, cy
+    return matrices
 
 
 def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int]) -> Camera:
@@ -117,7 +156,8 @@ def _read_opencv(path: Path) -> Matrix:
 def _read_numbers(path: Path) -> Matrix:
     """The first four numbers of a file, as ETH3D's SLAM benchmark writes them."""
     try:
-        fx, fy, cx, cy = (float(word) for word in path.read_text().split()[:4])
+        words = [word for _, line in words_of(read_text(path)) for word in line]
+        fx, fy, cx, cy = map(float, words[:4])
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} cannot be read as a camera ({error}); expected `fx fy cx cy`: write it again."
@@ -135,7 +175,7 @@ _FILES: dict[str, Callable[[Path], Matrix]] = {
 def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
     """Open3D's PinholeCameraIntrinsic, or the first of a trajectory; None if it is neither."""
     try:
-        content: Any = json.loads(path.read_text())
+        content: Any = json.loads(read_text(path))
         if "parameters" in content:
             content = next(iter(content["parameters"]), {}).get("intrinsic", {})
         if "intrinsic_matrix" not in content:
@@ -156,7 +196,7 @@ def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
     return np.diag([shape[1] / width, shape[0] / height, 1.0]) @ K
 
 
-def _checked(K: Matrix, path: Path, shape: tuple[int, int]) -> Matrix:
+def _checked(K: Matrix, path: Path | str, shape: tuple[int, int]) -> Matrix:
     """The matrix, if it can be that of images of `shape`, else `SequenceError`."""
     (h, w), (fx, fy, cx, cy) = shape, intrinsic_numbers(K)
     if not (np.isfinite(K).all() and min(fx, fy) > 0 and np.array_equal(K[2], (0, 0, 1))):

@@ -1,116 +1,201 @@
-"""Whether the poses of a recording fit its depth images."""
+"""How well poses and depth images fit: do neighbouring frames see the same surface at one place?"""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxshape.data.sequences.frames import USUAL_DEPTH_SCALES, Sequence, SequenceError
+from jaxshape.data.sequences.conventions import our_depth, our_pose
+from jaxshape.data.sequences.frames import SATURATED, Sequence, SequenceError, read_raw_depth
+from jaxshape.data.sequences.poses import StoredByColumns
 
 Pose = Float[np.ndarray, "4 4"]
 
+TOLERANCE = 0.02
+"""Share of the depth within which two frames see the same surface."""
 
-class PoseAgreement(NamedTuple):
-    """Share of depth pixels which a neighbouring frame sees at the same place.
+STRIDES = (1, 2, 4, 8, 16, 30, 60)
+"""Frames between the two of a pair, of which the first is taken that tells."""
+
+MOVED, HARDLY_MOVED = 0.5, 0.85
+"""Agreement as if the camera had not moved, below which a pair tells much of the motion; and
+below which pairs are taken where no pair of the recording tells much."""
+
+
+class Pair(NamedTuple):
+    """Two frames of a recording between which the camera moved, as they are written.
 
     Attributes:
-        as_given: Share with the poses as given, from 0 to 1.
-        inverted: Share with each pose inverted, from 0 to 1.
-        pairs: Pairs of frames that were compared; the shares are 0 if there were none.
+        depth_a: Depth of the first frame `[h w]`, in metres; 0 where nothing was measured.
+        depth_b: Depth of the second frame, alike.
+        T_a: Pose of the first frame `[4 4]`, as it is written.
+        T_b: Pose of the second frame, alike.
+        by_columns: Whether the matrices are stored by columns, and were transposed as a whole.
     """
 
-    as_given: float
-    inverted: float
-    pairs: int
+    depth_a: Float[np.ndarray, "h w"]
+    depth_b: Float[np.ndarray, "h w"]
+    T_a: Pose
+    T_b: Pose
+    by_columns: bool
 
 
-def poses_look_inverted(sequence: Sequence) -> bool:
-    """Whether the depth images agree better if each pose is taken as world to camera.
+class Seen(NamedTuple):
+    """A pair whose depth images are in our convention.
 
-    Evidence, not proof: it needs overlapping frames between which the camera moved, and a scene
-    that is more than one plane the camera slides along. Where it cannot tell, the answer is False.
+    Attributes:
+        points: Points of the first frame, in its camera `[3 n]`.
+        depth: Depth of the second frame `[h w]`.
+        pair: The pair.
     """
-    return looks_inverted(pose_agreement(sequence))
+
+    points: Float[np.ndarray, "3 n"]
+    depth: Float[np.ndarray, "h w"]
+    pair: Pair
 
 
-def looks_inverted(agreement: PoseAgreement) -> bool:
-    """Whether an agreement is clearly better with inverted poses."""
-    return agreement.inverted > agreement.as_given + 0.1
+def telling_pairs(sequence: Sequence, *, count: int = 8) -> tuple[Pair, ...]:
+    """Pairs of frames from all over a recording between which the camera clearly moved.
 
-
-def pose_agreement(sequence: Sequence, *, pairs: int = 8) -> PoseAgreement:
-    """Compare frames from all over a sequence with near ones, under both readings of the poses.
-
+    That is judged by the depth images alone, so that it does not depend on how poses are written.
     Frames without a pose, or that cannot be read, are passed over.
+
+    Args:
+        sequence: The recording, whose poses and depth images are taken as they are written.
+        count: Pairs that are looked for, 1 or more.
     """
-    K, shares = sequence.intrinsics, []
-    for first, second, motions in _telling_pairs(sequence, pairs):
-        with suppress(SequenceError):  # damaged; whoever uses the frame will hear of it
-            a, b = sequence.read_depth(first), sequence.read_depth(second)
-            shares.append([_same_surface(a, b, K, T_b_a) for T_b_a in motions])
-    as_given, inverted = np.mean(shares, axis=0) if shares else (0.0, 0.0)
-    return PoseAgreement(float(as_given), float(inverted), len(shares))
+    read = lru_cache(maxsize=2)(lambda index: _depth(sequence, index))
+    firsts = np.unique(np.linspace(0, max(0, len(sequence) - 2), count, dtype=int))
+    found = [_most_telling(sequence, int(first), read) for first in firsts]
+    clear = [pair for still, pair in filter(None, found) if still < MOVED]
+    return tuple(clear or [pair for _, pair in filter(None, found)])
 
 
-def scale_agreement(sequence: Sequence) -> dict[float, float]:
-    """Share of depth pixels on which neighbours agree, at its own and the other usual depth scales.
-
-    Poses have a scale of their own, so that of the depth images has to be the same. A scale at
-    which no pair of frames is plausible is left out.
-    """
-    scales = {sequence.depth_scale, *USUAL_DEPTH_SCALES}
-    rescaled = {s: pose_agreement(replace(sequence, depth_scale=s)) for s in sorted(scales)}
-    return {scale: found.as_given for scale, found in rescaled.items() if found.pairs}
-
-
-def _telling_pairs(sequence: Sequence, count: int) -> Iterator[tuple[int, int, tuple[Pose, Pose]]]:
-    """Frames from all over, each with the next, of 30, that tells, and both readings of T_b_a."""
-    for first in np.unique(np.linspace(0, len(sequence) - 1, count, dtype=int)):
-        T_a = _pose(sequence, int(first))
-        for second in range(first + 1, min(first + 31, len(sequence)) if T_a is not None else 0):
-            if T_a is not None and (T_b := _pose(sequence, second)) is not None:
-                if _tells(motions := _motions(T_a, T_b)):
-                    yield int(first), second, motions
-                    break
+def _most_telling(
+    sequence: Sequence, first: int, read: Callable[[int], Float[np.ndarray, "h w"] | None]
+) -> tuple[float, Pair] | None:
+    """The nearest frame that tells much, or else that which tells most, and how little it moved."""
+    a, pose_a, best = read(first), _pose(sequence, first), None
+    if a is None or pose_a is None:
+        return None
+    points = _points(a, sequence.intrinsics)
+    for second in (first + stride for stride in STRIDES if first + stride < len(sequence)):
+        b, pose_b = read(second), _pose(sequence, second)
+        if b is None or pose_b is None:
+            continue
+        still = _same_surface(points, b, sequence.intrinsics, np.eye(4), TOLERANCE)
+        if still < (HARDLY_MOVED if best is None else best[0]):
+            best = still, Pair(a, b, pose_a[0], pose_b[0], pose_a[1] or pose_b[1])
+        if still < MOVED:
+            break
+    return best
 
 
-def _pose(sequence: Sequence, index: int) -> Pose | None:
-    with suppress(SequenceError):
-        return sequence.read_pose(index)
+def _depth(sequence: Sequence, index: int) -> Float[np.ndarray, "h w"] | None:
+    """A depth image at the depth scale of the recording, plausible or not; None if damaged."""
+    with suppress(SequenceError):  # whoever uses the frame will hear of it
+        raw = read_raw_depth(sequence.files[index].depth, sequence.shape)
+        valid = (raw > 0) & (raw < SATURATED)
+        depth = np.where(valid, raw / sequence.depth_scale, 0)
+        depth = depth if sequence.correct_depth is None else sequence.correct_depth(depth)
+        return depth if valid.any() else None
     return None
 
 
-def _motions(T_a: Pose, T_b: Pose) -> tuple[Pose, Pose]:
-    """Return T_b_a if the poses map camera to world, and T_b_a if they map world to camera."""
-    return np.linalg.inv(T_b) @ T_a, T_b @ np.linalg.inv(T_a)
+def _pose(sequence: Sequence, index: int) -> tuple[Pose, bool] | None:
+    """A pose, and whether it is stored by columns; None without one."""
+    try:
+        T = sequence.read_pose(index)
+    except StoredByColumns as stored:
+        return stored.T, True
+    except SequenceError:
+        return None
+    return None if T is None else (np.asarray(T, np.float64), False)
 
 
-def _tells(motions: tuple[Pose, Pose]) -> bool:
-    """Whether two readings of a motion differ by 10 cm at 2 m."""
-    given, inverted = motions
-    return float(np.linalg.norm((given - inverted) @ (0.0, 0.0, 2.0, 1.0))) > 0.1
+def stored_by_columns(sequence: Sequence) -> bool:
+    """Whether a pose of the recording, of some from all over, is a matrix stored by columns."""
+    some = np.unique(np.linspace(0, len(sequence) - 1, 8, dtype=int))
+    poses = (_pose(sequence, int(index)) for index in some)
+    return any(pose is not None and pose[1] for pose in poses)
+
+
+def seen_by(
+    pairs: tuple[Pair, ...], K: Float[np.ndarray, "3 3"], names: tuple[str, ...] = ()
+) -> tuple[Seen, ...]:
+    """The pairs with depth images that are taken as written in these conventions.
+
+    Args:
+        pairs: The pairs.
+        K: The camera matrix.
+        names: Names of conventions; those of poses are passed over.
+    """
+
+    def both() -> Iterator[Seen]:
+        for pair in pairs:
+            a, b = (our_depth(depth, K, names) for depth in (pair.depth_a, pair.depth_b))
+            yield Seen(_points(a, K), b, pair)
+
+    return tuple(both())
+
+
+def agreement(
+    seen: tuple[Seen, ...],
+    K: Float[np.ndarray, "3 3"],
+    names: tuple[str, ...] = (),
+    *,
+    longer: float = 1.0,
+    tolerance: float = TOLERANCE,
+) -> float:
+    """Mean share, over pairs, of the pixels which the second frame sees at the same place.
+
+    A pixel counts where the second frame measured something at its place, but at least half of all
+    pixels count, so that poses which turn the camera away win nothing.
+
+    Args:
+        seen: The pairs, with depth images in our convention.
+        K: The camera matrix.
+        names: Names of conventions in which the poses are taken as written.
+        longer: Factor by which the depth images are made shallower: that of their depth scale.
+        tolerance: Share of the depth within which two frames see the same surface.
+
+    Returns:
+        From 0 to 1; 0 without a pair.
+    """
+    shares = []
+    for points, depth, pair in seen:
+        undo = tuple(name for name in names if not (pair.by_columns and name == "transposed"))
+        T_b_a = np.linalg.inv(our_pose(pair.T_b, undo)) @ our_pose(pair.T_a, undo)
+        T_b_a[:3, 3] *= longer  # instead of all depths by its inverse
+        shares.append(_same_surface(points, depth, K, T_b_a, tolerance))
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def _points(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]):
+    """Some points of a depth image, in its camera `[3 n]`."""
+    step = max(1, depth.shape[1] // 40)
+    row, column = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
+    row, column = row * step + step // 2, column * step + step // 2
+    pixel = np.stack([column + 0.5, row + 0.5, np.ones(len(row))])
+    return np.linalg.inv(K) @ pixel * depth[row, column]
 
 
 def _same_surface(
-    depth_a: Float[np.ndarray, "h w"],
+    points: Float[np.ndarray, "3 n"],
     depth_b: Float[np.ndarray, "h w"],
     K: Float[np.ndarray, "3 3"],
     T_b_a: Pose,
+    tolerance: float,
 ) -> float:
-    """Share of the valid pixels of `a` which, moved to `b`, lie within 3 % of its depth."""
-    step = max(1, depth_a.shape[1] // 80)
-    row, column = np.nonzero(depth_a[::step, ::step])
-    row, column = row * step, column * step
-    pixel = np.stack([column + 0.5, row + 0.5, np.ones(len(row))])
-    p_a = np.linalg.inv(K) @ pixel * depth_a[row, column]
-    p_b = T_b_a[:3, :3] @ p_a + T_b_a[:3, 3:]
-    u, v, z = K @ p_b
-    with np.errstate(divide="ignore", invalid="ignore"):
+    """Share of the points of `a` which, moved to `b`, lie within the tolerance of its depth."""
+    u, v, z = K @ (T_b_a[:3, :3] @ points + T_b_a[:3, 3:])
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         column, row = np.floor(u / z), np.floor(v / z)
     h, w = depth_b.shape
     seen = (z > 0) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
-    measured = depth_b[row[seen].astype(int), column[seen].astype(int)]
-    return float(np.sum(np.abs(measured - z[seen]) < 0.03 * z[seen]) / max(len(z), 1))
+    measured, z = depth_b[row[seen].astype(int), column[seen].astype(int)], z[seen]
+    same = (measured > 0) & (np.abs(measured - z) < tolerance * z)
+    return float(np.sum(same) / max(np.sum(measured > 0), points.shape[1] / 2, 1))

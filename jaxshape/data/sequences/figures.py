@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxshape.data.sequences.evidence import PoseAgreement, pose_agreement, scale_agreement
 from jaxshape.data.sequences.frames import (
     SATURATED,
     Sequence,
@@ -14,6 +13,7 @@ from jaxshape.data.sequences.frames import (
     read_mask,
     read_raw_depth,
 )
+from jaxshape.data.sequences.hypotheses import Reading
 from jaxshape.data.sequences.listing import numbers_in
 
 SAMPLES = 12
@@ -60,17 +60,22 @@ class Poses(NamedTuple):
     Attributes:
         known: Frames with a pose.
         length: Length of the camera's path between frames with poses, in metres.
-        agreement: Agreement of the poses with the depth images.
-        scales: Depth scales, and the share of depth pixels that agree with neighbouring frames at
-            each.
+        reading: How well the poses fit the depth images, as written and otherwise.
         damaged: A sentence for each pose that cannot be used.
+        is_used: Whether the best convention of `reading` is that in which the recording is read.
     """
 
     known: int
     length: float
-    agreement: PoseAgreement
-    scales: dict[float, float]
+    reading: Reading
     damaged: tuple[str, ...]
+    is_used: bool = False
+
+    @property
+    def agreement(self) -> float:
+        """Share of pixels on which neighbouring frames agree, as the recording is read."""
+        best = self.reading.best
+        return best.share if self.is_used and best is not None else self.reading.given
 
 
 def depths_of(sequence: Sequence) -> Depths:
@@ -95,10 +100,8 @@ def depths_of(sequence: Sequence) -> Depths:
     )
 
 
-def poses_of(sequence: Sequence) -> Poses | None:
-    """Read all poses, and compare some with the depth images; None where none were given."""
-    if not sequence.has_poses:
-        return None
+def poses_of(sequence: Sequence, reading: Reading) -> Poses:
+    """Read all poses of a recording, of which it is known how they may be read."""
     places, damaged = [], []
     for index in range(len(sequence)):
         try:
@@ -110,8 +113,7 @@ def poses_of(sequence: Sequence) -> Poses | None:
     return Poses(
         known=len(places),
         length=float(steps.sum()),
-        agreement=pose_agreement(sequence),
-        scales=scale_agreement(sequence),
+        reading=reading,
         damaged=tuple(damaged),
     )
 
@@ -120,12 +122,12 @@ def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
     """A sentence for each colour image or mask, of some, that cannot be used."""
     damaged = []
     for index in _sampled(sequence):
-        _, _, color, mask = sequence.files[index]
+        files = sequence.files[index]
         try:
-            if color is not None:
-                read_color(color, sequence.shape)
-            if mask is not None:
-                read_mask(mask, sequence.shape)
+            if files.color is not None:
+                read_color(files.color, sequence.shape)
+            if files.mask is not None:
+                read_mask(files.mask, sequence.shape)
         except SequenceError as error:
             damaged.append(str(error))
     return tuple(damaged)

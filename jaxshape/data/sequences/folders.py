@@ -9,20 +9,27 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
-from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
+from jaxshape.data.sequences.frames import (
+    Finding,
+    FrameFiles,
+    SequenceError,
+    usual_depth_scale,
+)
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
     color_images,
     depth_images,
     files_in,
+    has_depth_folder,
     mask_images,
     numbers_in,
     partners,
     with_colors_by_time,
 )
-from jaxshape.data.sequences.poses import read_pose
-from jaxshape.data.sequences.trajectories import read_trajectory
+from jaxshape.data.sequences.poses import StoredByColumns, known, read_pose
+from jaxshape.data.sequences.text import read_text, words_of
+from jaxshape.data.sequences.trajectories import read_unchecked
 
 MILLIMETRES = 1000.0
 
@@ -38,7 +45,7 @@ PoseReader = Callable[[int], Float[np.ndarray, "4 4"] | None]
 
 
 def fits_redwood(contents: Contents) -> bool:
-    depth = files_in(contents, ("depth",), (".png",)) if "depth" in contents.folders else {}
+    depth = files_in(contents, ("depth",), (".png",))
     return bool(depth) and all(map(_STAMPED.fullmatch, depth))
 
 
@@ -73,7 +80,7 @@ def _stamps(names: dict[str, Path]) -> Float[np.ndarray, " n"]:
 
 
 def fits_bundlesdf(contents: Contents) -> bool:
-    return "depth" in contents.folders and "cam_K.txt" in contents.files
+    return has_depth_folder(contents) and "cam_K.txt" in contents.files
 
 
 def list_bundlesdf(contents: Contents) -> Listed:
@@ -89,7 +96,7 @@ def list_bundlesdf(contents: Contents) -> Listed:
 
 
 def fits_open3d(contents: Contents) -> bool:
-    return "depth" in contents.folders
+    return has_depth_folder(contents)
 
 
 def list_open3d(contents: Contents) -> Listed:
@@ -107,7 +114,7 @@ def _by_name(contents: Contents) -> Listed:
     read = _pose_files(contents, list(depth)) or _trajectory_poses(contents, len(depth))
     return Listed(
         files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
-        depth_scale=MILLIMETRES,
+        depth_scale=usual_depth_scale(depth.values()),
         read_pose=read,
         camera=DefaultCamera(PRIMESENSE, "Open3D's default, a PrimeSense", sure=False),
         findings=_lone_colors(len(offered), color),
@@ -140,7 +147,11 @@ def _pose_files(contents: Contents, names: list[str]) -> PoseReader | None:
 
 def _reader(files: list[Path | None], is_object_to_camera: bool) -> PoseReader:
     def read(index: int) -> Float[np.ndarray, "4 4"] | None:
-        T = read_pose(files[index])
+        try:
+            T = read_pose(files[index])
+        except StoredByColumns as stored:
+            stored.T = np.linalg.inv(stored.T) if is_object_to_camera else stored.T
+            raise
         return np.linalg.inv(T) if is_object_to_camera and T is not None else T
 
     return read
@@ -150,7 +161,7 @@ def _trajectory_poses(contents: Contents, count: int) -> PoseReader | None:
     path = _find_trajectory(contents)
     if path is None:
         return None
-    trajectory = read_trajectory(path)
+    trajectory = read_unchecked(path)
     frames = trajectory.frames
     if len(frames) and frames.max() >= count:
         if len(frames) != count:
@@ -161,7 +172,11 @@ def _trajectory_poses(contents: Contents, count: int) -> PoseReader | None:
             )
         frames = np.arange(count)
     poses = dict(zip(frames.tolist(), trajectory.T_world_camera, strict=True))
-    return poses.get
+
+    def read(index: int) -> Float[np.ndarray, "4 4"] | None:
+        return known(poses[index], f"Pose {index} of {path}") if index in poses else None
+
+    return read
 
 
 def _find_trajectory(contents: Contents) -> Path | None:
@@ -180,14 +195,17 @@ def _find_trajectory(contents: Contents) -> Path | None:
 
 
 def _is_log(path: Path) -> bool:
-    with path.open(errors="replace") as file:
-        return re.fullmatch(r"\s*-?\d+\s+-?\d+\s+-?\d+\s*", file.readline(200)) is not None
+    try:
+        first = next(iter(words_of(read_text(path))), (0, []))[1]
+    except ValueError:
+        return False
+    return len(first) == 3 and all(re.fullmatch(r"-?\d+", word) for word in first)
 
 
 def _is_json_trajectory(path: Path) -> bool:
     if "traj" in path.name.lower():  # if it is none, its reader says what is wrong with it
         return True
     try:
-        return "parameters" in json.loads(path.read_text())
+        return "parameters" in json.loads(read_text(path))
     except (ValueError, TypeError):
         return False

@@ -1,27 +1,28 @@
 """Frames of an RGB-D recording, read and checked one at a time, when they are asked for."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
+from jaxshape.data.sequences.errors import SequenceError as SequenceError
+from jaxshape.data.sequences.rasters import Picture, open_picture
+
 SATURATED = 65535
 """The value that depth cameras write where they measured nothing sure; read as 0, unknown."""
 
-USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 5000.0, 10000.0)
+USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 """Depth units per metre that people use."""
 
 _PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: what depth cameras reach, with room to spare
 _USUAL_MEDIAN_DEPTH = 2.0  # metres: an object in a room
 
-
-class SequenceError(ValueError):
-    """A sequence on disk is not what its layout promises; says which file, and what to do."""
+_CONFIDENT = 1  # of 0, 1 and 2, as ARKit rates its depths: 0 is a guess
 
 
 class Finding(NamedTuple):
@@ -34,6 +35,11 @@ class Finding(NamedTuple):
 
     evidence: str
     advice: str
+
+    @property
+    def sentence(self) -> str:
+        """Both, as sentences."""
+        return f"{self.evidence.rstrip('.')}. {self.advice}"
 
 
 class Frame(NamedTuple):
@@ -48,6 +54,7 @@ class Frame(NamedTuple):
         T_world_camera: Pose of the camera `[4 4]`; None where no pose was given, or the recorder's
             own tracking was lost.
         mask: True on the object `[h w]`; None where no mask was given.
+        intrinsics: Camera matrix of this frame `[3 3]`, in pixels.
         time: Time of the depth image from any start, in seconds; None where the recording does not
             tell.
     """
@@ -57,6 +64,7 @@ class Frame(NamedTuple):
     color: UInt8[np.ndarray, "h w 3"] | None
     T_world_camera: Float[np.ndarray, "4 4"] | None
     mask: Bool[np.ndarray, "h w"] | None
+    intrinsics: Float[np.ndarray, "3 3"]
     time: float | None = None
 
 
@@ -68,12 +76,15 @@ class FrameFiles(NamedTuple):
         depth: Depth image.
         color: Colour image; None for none.
         mask: Mask of the object; None for none.
+        confidence: Confidence of each depth, 0, 1 or 2; None for none. Depths of confidence 0 are
+            left out.
     """
 
     name: str
-    depth: Path
-    color: Path | None
-    mask: Path | None
+    depth: Picture
+    color: Picture | None
+    mask: Picture | None
+    confidence: Picture | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +93,8 @@ class Sequence:
 
     Attributes:
         layout: Name of the layout on disk, a key of `LAYOUTS`.
-        intrinsics: Camera matrix of all depth images `[3 3]`, in pixels, where column j covers u in
-            [j, j + 1).
+        intrinsics: Camera matrix of all depth images, or of the first where each has its own
+            `[3 3]`, in pixels, where column j covers u in [j, j + 1).
         camera: Where the intrinsics come from.
         files: Files of each frame.
         read_pose: Index of a frame, from 0, to its T_world_camera `[4 4]`, checked; None where
@@ -95,6 +106,12 @@ class Sequence:
         color_delays: Seconds from a depth image to its colour image `[n]`, NaN where it has none;
             None without times.
         findings: Remarks made on opening that a user should know.
+        cameras: Camera matrix of each depth image `[n 3 3]`, in pixels; None where `intrinsics` is
+            that of all.
+        camera_is_guess: Whether the recording holds no camera, and that of such recordings is
+            taken.
+        correct_depth: From a depth image as it is written, in metres, to depth along the optical
+            axis; None where it is written so.
     """
 
     layout: str
@@ -108,6 +125,9 @@ class Sequence:
     times: Float[np.ndarray, " n"] | None = None
     color_delays: Float[np.ndarray, " n"] | None = None
     findings: tuple[Finding, ...] = ()
+    cameras: Float[np.ndarray, "n 3 3"] | None = None
+    camera_is_guess: bool = False
+    correct_depth: Callable[[Float[np.ndarray, "h w"]], Float[np.ndarray, "h w"]] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,13 +139,14 @@ class Sequence:
 
     def __getitem__(self, index: int) -> Frame:
         index = range(len(self))[index]
-        name, _, color, mask = self.files[index]
+        files = self.files[index]
         return Frame(
-            name=name,
+            name=files.name,
             depth=self.read_depth(index),
-            color=None if color is None else read_color(color, self.shape),
+            color=None if files.color is None else read_color(files.color, self.shape),
             T_world_camera=self.read_pose(index),
-            mask=None if mask is None else read_mask(mask, self.shape),
+            mask=None if files.mask is None else read_mask(files.mask, self.shape),
+            intrinsics=self.intrinsics if self.cameras is None else self.cameras[index],
             time=None if self.times is None else float(self.times[index]),
         )
 
@@ -138,16 +159,20 @@ class Sequence:
         Args:
             index: Number of the frame, from 0.
         """
-        return read_depth(self.files[index].depth, self.shape, depth_scale=self.depth_scale)
+        files = self.files[index]
+        depth = read_depth(files.depth, self.shape, depth_scale=self.depth_scale)
+        if files.confidence is not None:
+            depth = np.where(_read_confident(files.confidence, self.shape), depth, np.float32(0))
+        return depth if self.correct_depth is None else self.correct_depth(depth)
 
 
 # Depth -----------------------------------------------------------------------------------------
 
 
 def read_depth(
-    path: Path, shape: tuple[int, int], *, depth_scale: float
+    path: Picture, shape: tuple[int, int], *, depth_scale: float
 ) -> Float[np.ndarray, "h w"]:
-    """Read a 16-bit depth image as metres in float32; 0 where it holds 0 or 65535.
+    """Read a depth image as metres in float32; 0 where it holds 0, 65535 or nothing finite.
 
     Args:
         path: The image.
@@ -155,8 +180,8 @@ def read_depth(
         depth_scale: Depth units in a metre.
 
     Raises:
-        SequenceError: The image is damaged, not 16 bit or of another size, or its median depth
-            shows that `depth_scale` is wrong.
+        SequenceError: The image is damaged, of 8 bits, in colour or of another size, or its median
+            depth shows that `depth_scale` is wrong.
     """
     raw = read_raw_depth(path, shape)
     valid = (raw > 0) & (raw < SATURATED)
@@ -166,20 +191,38 @@ def read_depth(
     return depth
 
 
-def read_raw_depth(path: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w"]:
-    """Read the numbers of a 16-bit depth image, in its own units."""
+def read_raw_depth(path: Picture, shape: tuple[int, int]) -> Float[np.ndarray, "h w"]:
+    """Read the numbers of a depth image of 16 bits or of floats, in its own units."""
     with opened(path) as image:
         if (image.height, image.width) != shape:
             raise SequenceError(
                 f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the first depth "
                 "image: scale it to that size, or remove it."
             )
-        if image.mode not in ("I;16", "I;16B", "I"):
+        if image.mode not in ("I;16", "I;16B", "I", "F"):
             raise SequenceError(
                 f"{path} has Pillow mode {image.mode}; expected a depth image with one channel of "
-                "16 bit: save it again without conversion."
+                "16 bit or of floats: save it again without conversion."
             )
         return np.array(image, dtype=np.float32)
+
+
+def usual_depth_scale(pictures: Iterable[Picture]) -> float:
+    """Depth units in a metre where nothing says them: floats are metres, integers millimetres."""
+    for picture in islice(pictures, 20):
+        with suppress(SequenceError), opened(picture) as image:  # a damaged one says nothing
+            return 1.0 if image.mode == "F" else 1000.0
+    return 1000.0
+
+
+def _read_confident(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Where a map of confidences says that a depth is more than a guess."""
+    with opened(path) as image:
+        _check_aspect(image, shape, path)
+        pixels = np.array(image.resize((shape[1], shape[0]), Image.Resampling.NEAREST))
+    if pixels.ndim != 2:
+        raise SequenceError(f"{path} has colours; expected confidences of 0, 1 and 2: remove it.")
+    return pixels >= _CONFIDENT
 
 
 def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
@@ -190,14 +233,18 @@ def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
     return Finding(
         f"the median depth is {_readable_length(median)} at depth scale {depth_scale:g}; expected "
         f"{low:g} to {high:g} m",
-        f"is --depth-scale {likely_depth_scale(median, depth_scale):g} meant?",
+        f"is --depth-scale {likely_depth_scales(median, depth_scale)} meant?",
     )
 
 
-def likely_depth_scale(median: float, depth_scale: float) -> float:
-    """The usual scale at which a median depth becomes that of an object in a room."""
+def likely_depth_scales(median: float, depth_scale: float) -> str:
+    """The usual scales at which a median depth becomes that of an object in a room, in words."""
     usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
-    return min(USUAL_DEPTH_SCALES, key=lambda scale: abs(np.log(scale / usual)))
+    distance = {scale: abs(np.log(scale / usual)) for scale in USUAL_DEPTH_SCALES}
+    nearest = min(distance, key=distance.__getitem__)
+    near = [scale for scale in distance if distance[scale] < np.log(2)] or [nearest]
+    *others, last = (f"{scale:g}" for scale in near)
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _readable_length(metres: float) -> str:
@@ -209,7 +256,7 @@ def _readable_length(metres: float) -> str:
 # Colour and masks ------------------------------------------------------------------------------
 
 
-def read_color(path: Path, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+def read_color(path: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """Read a colour image, scaled to `shape`; `SequenceError` if damaged or of another aspect."""
     with opened(path) as image:
         _check_aspect(image, shape, path)
@@ -217,7 +264,7 @@ def read_color(path: Path, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]
     return np.array(scaled)
 
 
-def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+def read_mask(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Read where an image is not black, scaled to `shape`; raises as `read_color` does."""
     with opened(path) as image:
         _check_aspect(image, shape, path)
@@ -226,7 +273,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     return pixels != 0 if pixels.ndim == 2 else (pixels != 0).any(axis=-1)
 
 
-def _check_aspect(image: Image.Image, shape: tuple[int, int], path: Path) -> None:
+def _check_aspect(image: Image.Image, shape: tuple[int, int], path: Picture) -> None:
     if not same_aspect((image.height, image.width), shape):
         raise SequenceError(
             f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the depth images, or "
@@ -244,19 +291,21 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Image.Image]:
+def opened(path: Picture) -> Iterator[Image.Image]:
     """Open an image for the block that decodes it; `SequenceError` if it is damaged."""
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             yield image
-    except (OSError, SyntaxError) as error:  # Pillow raises either for a damaged file
+    except SequenceError:
+        raise
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SequenceError(
             f"{path} cannot be read as an image ({error}); expected a whole image file: copy it "
             "again from its source, or remove the frame."
         ) from error
 
 
-def read_shape(path: Path) -> tuple[int, int]:
+def read_shape(path: Picture) -> tuple[int, int]:
     """Height and width of an image, from its header alone."""
     with opened(path) as image:
         return image.height, image.width

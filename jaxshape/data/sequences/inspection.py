@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxshape.data.sequences.cameras import intrinsic_numbers
-from jaxshape.data.sequences.evidence import looks_inverted
+from jaxshape.data.sequences.conventions import AS_GIVEN, Convention, read_as
 from jaxshape.data.sequences.figures import (
     Depths,
     Gap,
@@ -21,16 +21,22 @@ from jaxshape.data.sequences.frames import (
     Finding,
     Sequence,
     depth_scale_fault,
-    likely_depth_scale,
+    likely_depth_scales,
 )
+from jaxshape.data.sequences.hypotheses import Reading, reading_of
 
 _USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; beyond them a scale is doubted, not refused
+
+
+BADLY = 0.5
+"""Agreement of poses and depth images below which nothing good can come of them."""
 
 
 class Inspection(NamedTuple):
     """Findings of `inspect_sequence`.
 
     Attributes:
+        sequence: The recording, read in the convention that was stated or found.
         depths: Figures of the sampled depth images.
         poses: Figures of the poses; None where the recording has none.
         colors: Frames with a colour image.
@@ -40,6 +46,7 @@ class Inspection(NamedTuple):
         warnings: What looks wrong, and what to do about it.
     """
 
+    sequence: Sequence
     depths: Depths
     poses: Poses | None
     colors: int
@@ -49,28 +56,47 @@ class Inspection(NamedTuple):
     warnings: tuple[Finding, ...]
 
 
-def inspect_sequence(sequence: Sequence) -> Inspection:
+def inspect_sequence(
+    sequence: Sequence, stated: tuple[str, ...] | None = None, *, keep_scale: bool = False
+) -> Inspection:
     """Look at a recording: names and poses of all frames, and images of some.
 
+    Where poses and depth images fit far better in another convention, that is used and said.
+
     Args:
-        sequence: The recording.
+        sequence: The recording, read as it is written.
+        stated: Names of the conventions in which it is known to be written, or `as-given`; None to
+            find out.
+        keep_scale: Whether its depth scale is known, so that no other is used.
 
     Raises:
         SequenceError: None of the sampled depth images can be read.
+        ValueError: There is no convention of a name.
     """
-    depths, poses, gaps = depths_of(sequence), poses_of(sequence), gaps_of(sequence)
-    better = _better_scale(poses, sequence.depth_scale, depths.median)
+    depths, reading, used = depths_of(sequence), None, None
+    own = Convention(tuple(name for name in stated or () if name != AS_GIVEN))
+    sequence = read_as(sequence, own)
+    if sequence.has_poses:
+        reading = reading_of(sequence, depths.median)
+        used = _used(reading, keep_scale) if stated is None else None
+    if used is not None:
+        depths = _rescaled(depths, sequence, used)
+        sequence = read_as(sequence, used)
+    is_used = used is not None
+    poses = None if reading is None else poses_of(sequence, reading)._replace(is_used=is_used)
+    gaps = gaps_of(sequence)
     warnings = [
         *sequence.findings,
         *_of_images(depths, damaged_pictures(sequence)),
-        *_of_scale(depths.median, sequence.depth_scale, better),
+        *_of_scale(depths.median, sequence.depth_scale, reading),
         *_of_camera(sequence),
-        *_of_directions(poses if better is None else None),
+        *_of_convention(reading, is_used),
         *_of_missing(poses, len(sequence)),
         *_of_gaps(gaps),
         *_of_delays(sequence),
     ]
     return Inspection(
+        sequence=sequence,
         depths=depths,
         poses=poses,
         colors=sum(files.color is not None for files in sequence.files),
@@ -79,6 +105,19 @@ def inspect_sequence(sequence: Sequence) -> Inspection:
         rate=rate_of(sequence),
         warnings=tuple(warnings),
     )
+
+
+def _used(reading: Reading, keep_scale: bool) -> Convention | None:
+    """The convention that is used without being asked for; None for that which is written."""
+    if reading.best is None or not reading.is_sure:
+        return None
+    convention = reading.best.convention
+    return None if keep_scale and convention.depth_scale is not None else convention
+
+
+def _rescaled(depths: Depths, sequence: Sequence, convention: Convention) -> Depths:
+    scale = convention.depth_scale or sequence.depth_scale
+    return depths._replace(median=depths.median * sequence.depth_scale / scale)
 
 
 # Images ----------------------------------------------------------------------------------------
@@ -108,54 +147,18 @@ def _of_images(depths: Depths, pictures: tuple[str, ...]) -> Iterator[Finding]:
 # Depth scale and camera ------------------------------------------------------------------------
 
 
-class _Scale(NamedTuple):
-    """A depth scale, and how well neighbouring frames agree at it.
-
-    Attributes:
-        scale: Depth units in a metre.
-        share: Share of pixels that agree at this scale.
-        own_share: Share of pixels that agree at the recording's own scale.
-    """
-
-    scale: float
-    share: float
-    own_share: float
-
-
-def _better_scale(poses: Poses | None, own: float, median: float) -> _Scale | None:
-    """The depth scale at which the poses fit clearly better, if there is one.
-
-    Where the median depth is unusual already, a little better is enough: what is read as too far
-    away moves too little between frames to disagree much.
-    """
-    if poses is None or not poses.scales:
-        return None
-    best = max(poses.scales, key=lambda scale: poses.scales[scale])
-    found = _Scale(best, poses.scales[best], poses.scales.get(own, 0.0))
-    margin = 0.1 if _USUAL_DEPTHS[0] <= median <= _USUAL_DEPTHS[1] else 0.0
-    rival = max(found.own_share, poses.agreement.inverted)
-    return found if found.share > rival + margin else None
-
-
-def _of_scale(median: float, own: float, better: _Scale | None) -> Iterator[Finding]:
-    """A warning of a wrong depth scale, from the poses or else from the median depth, in metres."""
+def _of_scale(median: float, own: float, reading: Reading | None) -> Iterator[Finding]:
+    """Doubts of the depth scale by the median depth, in metres, where poses do not tell it."""
     low, high = _USUAL_DEPTHS
-    if better is not None:
-        yield Finding(
-            f"the poses fit the depth images at depth scale {better.scale:g}, where "
-            f"{better.share:.0%} of the pixels agree with neighbouring frames, and not at "
-            f"{own:g}, where {better.own_share:.0%} do",
-            f"Is --depth-scale {better.scale:g} meant?",
-        )
-    elif median and (fault := depth_scale_fault(median, own)):
+    if not median or (reading and reading.best and reading.best.convention.depth_scale):
+        return
+    if fault := depth_scale_fault(median, own):
         yield fault._replace(advice=fault.advice[0].upper() + fault.advice[1:])
-    elif median and not low <= median <= high:
-        likely = likely_depth_scale(median, own)
+    elif not low <= median <= high:
         yield Finding(
             f"the median depth is {median:.3g} m at depth scale {own:g}; that of an object in a "
             f"room is {low:g} to {high:g} m",
-            f"Check the unit: at --depth-scale {likely:g} it would be {median * own / likely:.3g} "
-            "m.",
+            f"Check the unit: is --depth-scale {likely_depth_scales(median, own)} meant?",
         )
 
 
@@ -184,24 +187,34 @@ def _of_camera(sequence: Sequence) -> Iterator[Finding]:
 # Poses, gaps and times -------------------------------------------------------------------------
 
 
-def _of_directions(poses: Poses | None) -> Iterator[Finding]:
-    """Whether the poses fit the depth images, at a depth scale that is not in doubt."""
-    if poses is None:
+def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:
+    """Whether the poses fit the depth images, and in which convention they would."""
+    if reading is None:
         return
-    as_given, inverted, pairs = poses.agreement
-    compared = f"of the pixels of {pairs} pairs of frames agree"
-    if looks_inverted(poses.agreement):
-        yield Finding(
-            f"the poses look like world to camera: {inverted:.0%} {compared} if each is inverted, "
-            f"{as_given:.0%} as given",
-            "Write camera to world.",
-        )
-    elif pairs and as_given < 0.3:
-        yield Finding(
-            f"the poses fit the depth images badly: {as_given:.0%} {compared}, {inverted:.0%} if "
-            "each is inverted",
-            "Check the depth scale, the camera, and that the poses are those of the depth images.",
-        )
+    pairs, tolerance = reading.pairs, reading.tolerance
+    compared = f"of the pixels of {pairs} pairs of frames agree to {tolerance:.0%}"
+    best, rival = reading.best, reading.rival
+    if best is not None:
+        meaning, options = best.convention.meaning, best.convention.options
+        if reading.by_columns and not reading.pairs:
+            evidence = "the last column of the matrices is 0 0 0 1"
+        else:
+            evidence = f"so {best.share:.0%} {compared}, as written {reading.given:.0%}"
+        if is_used:
+            advice = f"It is read so. {options} states it; --convention {AS_GIVEN} denies it."
+        elif rival is None:
+            advice = f"Is {options} meant?"
+        else:
+            advice = f"Is {options} meant, or {rival.convention.options} ({rival.share:.0%})?"
+        yield Finding(f"{meaning}: {evidence}", advice)
+    if reading.pairs and (best is None or best.share < BADLY):
+        if reading.given < BADLY:
+            yield Finding(
+                f"the poses fit the depth images badly: {reading.given:.0%} {compared}, in no "
+                "known convention many more",
+                "Check the depth scale, the camera, and that the poses are those of the depth "
+                "images.",
+            )
 
 
 def _of_missing(poses: Poses | None, count: int) -> Iterator[Finding]:

@@ -9,12 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxshape.data.sequences.cameras import DefaultCamera
+from jaxshape.data.sequences.cameras import Calibration, DefaultCamera
 from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
 from jaxshape.data.sequences.poses import NEAR
 
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm")
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".npy", ".exr")
 COLOR_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".ppm")
+
+DEPTH_FOLDERS = ("depth", "depths", "Depth", "aligned_depth_to_color")
+COLOR_FOLDERS = ("color", "image", "rgb", "colors", "images", "Color", "RGB")
 
 
 class Contents(NamedTuple):
@@ -41,6 +44,8 @@ class Listed(NamedTuple):
         times: Times of the depth images, in seconds; None where they are not known.
         color_delays: Seconds from a depth image to its colour image; None where they are not known.
         camera: The camera of such recordings, for folders that hold none.
+        calibration: Cameras that the recording's own files give; None where its folder is searched
+            for one.
         findings: Remarks that a user should know.
     """
 
@@ -50,6 +55,7 @@ class Listed(NamedTuple):
     times: Float[np.ndarray, " n"] | None = None
     color_delays: Float[np.ndarray, " n"] | None = None
     camera: DefaultCamera | None = None
+    calibration: Calibration | None = None
     findings: tuple[Finding, ...] = ()
 
 
@@ -78,18 +84,23 @@ def files_in(
 
 
 def depth_images(contents: Contents) -> dict[str, Path]:
-    """The images of the sub-folder `depth`; `SequenceError` if there are none."""
-    images = files_in(contents, ("depth",), DEPTH_SUFFIXES)
+    """The images of the folder of depth images; `SequenceError` if there are none."""
+    images = files_in(contents, DEPTH_FOLDERS, DEPTH_SUFFIXES)
     if not images:
+        name = next((one for one in DEPTH_FOLDERS if one in contents.folders), "depth")
         raise SequenceError(
-            f"{contents.folder / 'depth'} holds no depth image; expected 16-bit PNG files: "
+            f"{contents.folder / name} holds no depth image; expected 16-bit PNG files: "
             "copy them there."
         )
     return images
 
 
+def has_depth_folder(contents: Contents) -> bool:
+    return not contents.folders.isdisjoint(DEPTH_FOLDERS)
+
+
 def color_images(contents: Contents) -> dict[str, Path]:
-    return files_in(contents, ("color", "image", "rgb"), COLOR_SUFFIXES)
+    return files_in(contents, COLOR_FOLDERS, COLOR_SUFFIXES)
 
 
 def mask_images(contents: Contents) -> dict[str, Path]:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxshape.data.sequences.frames import SequenceError
+from jaxshape.data.sequences.text import number, read_text, words_of
 
 READABLE_GAP = 0.1
 """Seconds between two poses within which the camera's way is taken as straight."""
@@ -16,24 +17,34 @@ NEAR = 0.02
 """Seconds within which two readings are of the same moment, as in TUM's own tools."""
 
 
+class StoredByColumns(SequenceError):
+    """A pose is a rigid motion once it is transposed, which cannot be by chance.
+
+    Attributes:
+        T: The pose, transposed `[4 4]`.
+    """
+
+    def __init__(self, sentence: str, T: Float[np.ndarray, "4 4"]) -> None:
+        super().__init__(sentence)
+        self.T = T
+
+
 def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
-    """Read a square matrix of `size` rows of numbers; `SequenceError` if it is anything else."""
+    """Read a square matrix of `size` rows of numbers; `SequenceError` if it is anything else.
+
+    Comments and commas are passed over.
+    """
     try:
-        rows = [[number(word) for word in line.split()] for line in path.read_text().splitlines()]
-        matrix = np.array([row for row in rows if row], dtype=np.float64)
-        if matrix.shape != (size, size):
+        rows = [[number(word) for word in words] for _, words in words_of(read_text(path))]
+        if [len(row) for row in rows] != [size] * size:
             raise ValueError(f"its lines hold {[len(row) for row in rows]} numbers")
+        matrix = np.array(rows, dtype=np.float64)
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} is not a matrix ({error}); expected {size} lines of {size} numbers: write it "
             "again."
         ) from error
     return matrix
-
-
-def number(word: str) -> float:
-    """A number from a text file, Windows' spellings of NaN and infinity, `-1.#IND`, among them."""
-    return np.nan if "#" in word else float(word)
 
 
 def read_pose(path: Path | None) -> Float[np.ndarray, "4 4"] | None:
@@ -67,6 +78,13 @@ def check_rigid(T: Float[np.ndarray, "4 4"], source: object) -> None:
     """Raise `SequenceError`, naming `source`, unless a matrix is a rigid motion."""
     if is_rigid(T):
         return
+    if is_rigid(T.T):
+        raise StoredByColumns(
+            f"{source} has the last row {T[3].tolist()} and the last column 0 0 0 1, so it is "
+            "stored by columns; expected a rigid motion with the last row 0 0 0 1: transpose it, "
+            "or add --convention transposed.",
+            T.T,
+        )
     if not np.isfinite(T).all():
         fault, remedy = "holds NaN or infinity", "remove it, if the camera was lost there"
     elif np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-6:
@@ -115,4 +133,28 @@ def _between(
     turn = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([T_a[:3, :3], T_b[:3, :3]])))
     T[:3, :3] = turn(share).as_matrix()
     T[:3, 3] = (1 - share) * T_a[:3, 3] + share * T_b[:3, 3]
+    return T
+
+
+def from_opengl(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Poses of cameras with y up and z backwards, as OpenGL, Blender and ARKit have, as ours."""
+    return T * np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def from_quaternions(
+    places: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"], source: object
+) -> Float[np.ndarray, "n 4 4"]:
+    """Poses from places and quaternions x y z w; NaN where they are not finite."""
+    T = np.full((len(places), 4, 4), np.nan)
+    finite = np.isfinite(places).all(axis=1) & np.isfinite(quaternions).all(axis=1)
+    lengths = np.linalg.norm(quaternions, axis=1)
+    if (bad := np.flatnonzero(finite & (np.abs(lengths - 1) > 1e-2))).size:
+        raise SequenceError(
+            f"{source}: pose {bad[0]} has a quaternion of length {lengths[bad[0]]:.3g}; expected "
+            "x y z w of length 1: write it again."
+        )
+    T[finite] = np.eye(4)
+    if finite.any():
+        T[finite, :3, :3] = Rotation.from_quat(quaternions[finite]).as_matrix()
+        T[finite, :3, 3] = places[finite]
     return T

@@ -9,7 +9,8 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxshape.data.sequences.frames import SequenceError
-from jaxshape.data.sequences.poses import check_rigid, is_rigid, number
+from jaxshape.data.sequences.poses import check_rigid, is_rigid
+from jaxshape.data.sequences.text import number, read_text, words_of
 from jaxshape.files import write_text
 
 
@@ -58,21 +59,25 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Raises:
         SequenceError: The file cannot be read, or a pose is not a rigid motion.
     """
-    path = Path(path)
-    read = {".log": _read_log, ".json": _read_json}.get(path.suffix.lower(), _read_tum)
-    try:
-        trajectory = read(path.read_text())
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise SequenceError(
-            f"{path} cannot be read as a trajectory ({type(error).__name__}: {error}); expected "
-            "TUM's `time tx ty tz qx qy qz qw`, or Open3D's .log or .json: write it again."
-        ) from error
+    trajectory = read_unchecked(Path(path))
     T = trajectory.T_world_camera
     finite = np.isfinite(T).all(axis=(1, 2))
     for bad in np.flatnonzero(finite & ~is_rigid(T)):
         check_rigid(T[bad], f"Pose {bad} of {path}")
     times = None if trajectory.times is None else trajectory.times[finite]
     return Trajectory(T[finite], trajectory.frames[finite], times)
+
+
+def read_unchecked(path: Path) -> Trajectory:
+    """Read a trajectory as `read_trajectory` does, with poses that are lost or not rigid."""
+    read = {".log": _read_log, ".json": _read_json}.get(path.suffix.lower(), _read_tum)
+    try:
+        return read(read_text(path))
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise SequenceError(
+            f"{path} cannot be read as a trajectory ({type(error).__name__}: {error}); expected "
+            "TUM's `time tx ty tz qx qy qz qw`, or Open3D's .log or .json: write it again."
+        ) from error
 
 
 def write_trajectory(
@@ -107,14 +112,14 @@ def write_trajectory(
 
 
 def _read_tum(text: str) -> Trajectory:
-    numbers = np.array(
-        [
-            [number(word) for word in line.replace(",", " ").split()[:8]]
-            for line in text.splitlines()
-            if line.strip() and not line.startswith("#")
-        ],
-        dtype=np.float64,
-    ).reshape(-1, 8)
+    lines = words_of(text)
+    for line, words in lines:
+        if len(words) != 8:
+            euroc = "; in EuRoC's, keep the first eight columns and put w last"
+            hint = euroc if len(words) == 17 else ""
+            raise ValueError(f"line {line} holds {len(words)} numbers, not 8{hint}")
+    numbers = np.array([[number(w) for w in words] for _, words in lines], dtype=np.float64)
+    numbers = numbers.reshape(-1, 8)
     quaternions, norms = numbers[:, 4:], np.linalg.norm(numbers[:, 4:], axis=1)
     known = np.isfinite(numbers).all(axis=1)
     if (known & (np.abs(norms - 1) > 1e-2)).any():
@@ -143,7 +148,7 @@ def _tum_text(trajectory: Trajectory) -> str:
 
 
 def _read_log(text: str) -> Trajectory:
-    words = [line.split() for line in text.splitlines() if line.strip()]
+    words = [words for _, words in words_of(text)]
     if len(words) % 5:
         raise ValueError(f"it holds {len(words)} lines, not five for each pose")
     T = np.array(

@@ -1,13 +1,14 @@
 """TUM RGB-D (Sturm et al., IROS 2012): lists of images and poses, each with its time."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
-from jaxshape.data.sequences.frames import FrameFiles, SequenceError
+from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
@@ -15,7 +16,8 @@ from jaxshape.data.sequences.listing import (
     partners,
     with_colors_by_time,
 )
-from jaxshape.data.sequences.poses import known, poses_at
+from jaxshape.data.sequences.poses import READABLE_GAP, known, poses_at
+from jaxshape.data.sequences.text import read_text
 from jaxshape.data.sequences.trajectories import read_trajectory
 
 _CALIBRATED = {
@@ -46,37 +48,66 @@ def list_frames(contents: Contents) -> Listed:
     if "rgb.txt" in contents.files:
         color_times, offered = _read_list(folder / "rgb.txt")
     color, delays = with_colors_by_time(times, color_times, offered)
+    read_pose, doubts = _poses(folder / "groundtruth.txt", times)
     names = [path.stem for path in depth]
     masks = partners(names, mask_images(contents))
     return Listed(
         files=tuple(map(FrameFiles, names, depth, color, masks)),
         depth_scale=5000.0,
-        read_pose=_poses(folder / "groundtruth.txt", times),
+        read_pose=read_pose,
         times=times,
         color_delays=delays if offered else None,
         camera=_camera_of(folder),
+        findings=doubts,
     )
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
-    """Times, rising, and images of lines `time file`."""
+    """Times, rising, and images of lines `time file`; a few lines may stand in another order."""
     try:
-        words = [line.split(maxsplit=1) for line in path.read_text().splitlines()]
-        pairs = sorted((float(w[0]), w[1].strip()) for w in words if w and not w[0].startswith("#"))
+        words = [line.split(maxsplit=1) for line in read_text(path).splitlines()]
+        pairs = [(float(w[0]), w[1].strip()) for w in words if w and not w[0].startswith("#")]
     except (OSError, ValueError, IndexError) as error:
         raise SequenceError(
             f"{path} is not a list of images ({error}); expected lines of `time file`: write it "
             "again."
         ) from error
+    check_rising(np.array([time for time, _ in pairs]), path)
+    pairs = sorted(pairs)
     return np.array([time for time, _ in pairs]), [path.parent / file for _, file in pairs]
 
 
-def _poses(path: Path, times: Float[np.ndarray, " n"]):
+def check_rising(times: Float[np.ndarray, " n"], path: Path) -> None:
+    """Raise `SequenceError` where a tenth of the times do not rise, as intervals do not."""
+    still = np.flatnonzero(np.diff(times) <= 0)
+    if len(still) > 0.1 * len(times):
+        first = times[still[0]], times[still[0] + 1]
+        raise SequenceError(
+            f"{path} has {len(still)} times that do not rise, {first[0]:g} and then {first[1]:g} "
+            "among them; expected seconds from one start in the order of the film, not intervals: "
+            "write their sums."
+        )
+
+
+def _poses(
+    path: Path, times: Float[np.ndarray, " n"]
+) -> tuple[Callable[[int], Float[np.ndarray, "4 4"] | None] | None, tuple[Finding, ...]]:
+    """Poses at the times of the depth images; none where the two never overlap, which is said."""
     if not path.is_file():
-        return None
+        return None, ()
     trajectory = read_trajectory(path)
     if trajectory.times is None or len(trajectory.times) == 0:
-        return None
+        return None, ()
+    check_rising(trajectory.times, path)
+    first, last = trajectory.times.min(), trajectory.times.max()
+    if first > times[-1] + READABLE_GAP or last < times[0] - READABLE_GAP:
+        apart = Finding(
+            f"{path.name} holds poses from {first:.3f} to {last:.3f} s, and the depth images are "
+            f"from {times[0]:.3f} to {times[-1]:.3f} s: they have no time in common, so no pose is "
+            "read",
+            "Write the times of both by the same clock, in seconds.",
+        )
+        return None, (apart,)
     order = np.argsort(trajectory.times, kind="stable")
     pose = poses_at(trajectory.times[order], trajectory.T_world_camera[order], times)
 
@@ -84,7 +115,7 @@ def _poses(path: Path, times: Float[np.ndarray, " n"]):
         T = pose(index)
         return None if T is None else known(T, path)
 
-    return read
+    return read, ()
 
 
 def _camera_of(folder: Path) -> DefaultCamera:

@@ -15,14 +15,14 @@ amount of memory, its depth image and one cloud. [host, around jitted parts]
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jaxlie
-from jaxtyping import Array, Key
+from jaxtyping import Array, Bool, Key
 
 from jaxshape.data.boxes import Box
 from jaxshape.geometry.grids import binary
@@ -82,10 +82,10 @@ class Mapper(NamedTuple):
             step`: the map of a first frame, whose object lies in `box`, in the world. The object is
             cut out by a box larger by the share `room`.
         step: `(state, prepared, T_given=None, cut=None) -> state, step`: track a frame, unless its
-            pose is given, and map it if it has moved enough. `cut(box, T_world_camera)` tells which
-            pixels of a new keyframe may show the object, once its pose is known.
-        moved: `(state, box, *, room=0.0) -> state, shape`: the same keyframes, mapped in another
-            box.
+            pose is given, and map it if it has moved enough. `cut(T_world_camera)` gives the parts
+            of a new keyframe and the pixels that show the object, once its pose is known.
+        moved: `(state, box, *, room=0.0, segmented=None) -> state, shape`: the same keyframes,
+            mapped in another box, with other pixels of each taken for the object.
         finish: `state -> state, shape`: realign once more, and search as long as the settings
             allow.
     """
@@ -214,11 +214,12 @@ def _mapped(
     clock: "_Clock",
 ) -> tuple[MapState, Step]:
     """The map with the frame that was tracked last as one more keyframe."""
-    T = state.T_world_camera
+    T, segmented = state.T_world_camera, None
     if cut is not None:
-        prepared = prepared._replace(masked=prepared.masked & cut(state.place.cut, T))
-        clock.lap("cut", prepared)
-    new = keyframe_of(prepared, state.place, T, odometry_of(state, T, alignment))
+        found, segmented = cut(T)
+        prepared = prepared._replace(parts=found)
+        clock.lap("cut", segmented)
+    new = keyframe_of(prepared, state.place, T, odometry_of(state, T, alignment), segmented)
     state = state._replace(keyframes=(*state.keyframes, new), view=prepared.view)
     state = added(state, new)
     clock.lap("fuse", state)
@@ -250,14 +251,20 @@ def _is_realigned(parts: _Parts, state: MapState) -> bool:
 
 
 def _moved(
-    parts: _Parts, state: MapState, box: Box, *, room: float = 0.0
+    parts: _Parts,
+    state: MapState,
+    box: Box,
+    *,
+    room: float = 0.0,
+    segmented: Sequence[Bool[Array, "h w"] | None] | None = None,
 ) -> tuple[MapState, Reconstruction | None]:
     """The same keyframes, mapped in another box."""
+    pixels = segmented or [None] * len(state.keyframes)
     place = place_of(box, parts.prior.resolution, room, isotropic=parts.mapping.isotropic)
     anew = assemble(
         parts.prior,
         place,
-        tuple(cut_anew(one, place) for one in state.keyframes),
+        tuple(cut_anew(one, place, of) for one, of in zip(state.keyframes, pixels, strict=True)),
         state.view,
         parts.mapping,
         T_world_camera=state.T_world_camera,

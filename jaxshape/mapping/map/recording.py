@@ -13,25 +13,23 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Float
 
-from jaxshape.data.boxes import Box, points_in_box
-from jaxshape.data.sequences import Frame, Sequence, SequenceError
-from jaxshape.geometry import camera
+from jaxshape.data.sequences import Sequence, SequenceError
+from jaxshape.mapping.map.cutting import cut_all, cut_new, is_outgrown, parts_in
 from jaxshape.mapping.map.mapper import Mapper, Step
 from jaxshape.mapping.map.state import MapState
-from jaxshape.mapping.placement.finding import Start, placed_again, room
-from jaxshape.mapping.segmentation.segment import segment_inside
-from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
+from jaxshape.mapping.placement.finding import Start, on_the_floor, placed_again, room, with_room
+from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.reconstruction import Reconstruction
 
 PLACE_AGAIN = (2, 3, 5, 8, 13)
 """Numbers of keyframes after which the object is placed anew."""
+
+REVISIONS = 2
+"""Times that the object is placed anew after one keyframe, where other pixels become the object."""
 
 
 class FrameLog(NamedTuple):
@@ -73,6 +71,11 @@ class Progress(NamedTuple):
     start: Start
     logs: tuple[FrameLog, ...]
     shape: Reconstruction | None = None
+
+    def of_keyframes(self) -> Iterator[tuple[FrameLog, Keyframe]]:
+        """The log of each keyframe, and the keyframe as the map keeps it."""
+        logs = (log for log in self.logs if log.status == "keyframe")
+        return zip(logs, self.state.keyframes, strict=True)
 
 
 def follow(
@@ -116,7 +119,9 @@ def follow(
 
 def _begin(sequence: Sequence, start: Start, mapper: Mapper, use_poses: bool) -> Progress:
     frame = sequence[start.index]
-    prepared = prepare(frame, sequence.intrinsics, start.masked)
+    prepared = prepare(frame, start.masked)
+    if start.T_level_world is not None and frame.mask is None:
+        prepared = prepared._replace(parts=parts_in(prepared, first=True))
     state, step = mapper.init(
         prepared,
         start.box,
@@ -140,10 +145,10 @@ def _next(
         log = FrameLog(index, name, "unreadable", str(problem), last, None, {})
         return progress._replace(logs=(*logs, log))
     given = frame.T_world_camera if use_poses else None
-    prepared = prepare(frame, sequence.intrinsics)
+    prepared = prepare(frame)
     # A mask, or a box that was given, says what is the object; one that was found is not sure.
     is_estimated = progress.start.T_level_world is not None and frame.mask is None
-    cut = partial(_cut, frame, sequence, state.keyframes) if is_estimated else None
+    cut = partial(cut_new, prepared, state.keyframes, state.place.cut) if is_estimated else None
     state, step = mapper.step(state, prepared, None if given is None else as_pose(given), cut)
     relative = None
     if step.T_world_camera is not None:
@@ -161,31 +166,6 @@ def _next(
     return Progress(state, progress.start, (*logs, log), step.shape or progress.shape)
 
 
-def _cut(
-    frame: Frame, sequence: Sequence, keyframes: tuple[Keyframe, ...], box: Box, T: jaxlie.SE3
-) -> Bool[Array, "_ _"]:
-    """The clusters of a frame that lie mostly in the object's box and are nothing seen before."""
-    others = np.concatenate([_others(one, box) for one in keyframes[:1] + keyframes[1:][-8:]])
-    T_world_camera = np.asarray(T.as_matrix(), np.float64)
-    found = segment_inside(frame.depth, sequence.intrinsics, box, T_world_camera, others)
-    return resized(found, keyframes[0].depth.shape)
-
-
-def _others(keyframe: Keyframe, box: Box) -> Float[np.ndarray, "n 3"]:
-    """World points in the object's box that a keyframe took for something else."""
-    points = np.asarray(_world_points(keyframe), np.float64)[::3, ::3]
-    other = (~np.asarray(keyframe.masked) & (np.asarray(keyframe.depth) > 0))[::3, ::3]
-    points = points[other]
-    return points[points_in_box(points, box)]
-
-
-@jax.jit
-def _world_points(keyframe: Keyframe) -> Float[Array, "h w 3"]:
-    known = jnp.where(jnp.isfinite(keyframe.depth), keyframe.depth, 0)
-    points = camera.unproject(keyframe.intrinsics, known)
-    return camera.transform(keyframe.T_world_camera, points)
-
-
 def _figures(step: Step) -> dict[str, float]:
     figures = {f"seconds_{part}": seconds for part, seconds in step.seconds.items()}
     if step.alignment is not None:
@@ -195,12 +175,25 @@ def _figures(step: Step) -> dict[str, float]:
 
 
 def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progress:
-    """The progress with the object's box estimated again, where that is due."""
-    is_estimated = progress.start.T_level_world is not None
-    if not is_estimated or len(progress.state.keyframes) not in PLACE_AGAIN:
+    """The progress with the object's box estimated again, where that is due.
+
+    It is due after some keyframes, and where one shows the floor, or more of the object than the
+    box holds. With another box other pixels may be the object, so that it is placed again.
+    """
+    if progress.start.T_level_world is None:
         return progress
-    start = placed_again(progress.start, prior, progress.state.keyframes)
-    state, shape = mapper.moved(progress.state, start.box, room=room(start))
+    state, keyframes = progress.state, progress.state.keyframes
+    start = on_the_floor(progress.start, keyframes)
+    is_revised = start is not progress.start or is_outgrown(start.box, keyframes)
+    if not is_revised and len(keyframes) not in PLACE_AGAIN:
+        return progress
+    for _ in range(REVISIONS):
+        keyframes = cut_all(keyframes, with_room(start))
+        start = placed_again(start, prior, keyframes)
+        pixels = [one.segmented for one in cut_all(keyframes, with_room(start))]
+        if all(bool((a == b.segmented).all()) for a, b in zip(pixels, keyframes, strict=True)):
+            break
+    state, shape = mapper.moved(state, start.box, room=room(start), segmented=pixels)
     return progress._replace(state=state, start=start, shape=shape)
 
 

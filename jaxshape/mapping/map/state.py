@@ -136,8 +136,8 @@ def added(state: MapState, keyframe: Keyframe) -> MapState:
         jnp.float32(np.linalg.inv(state.place.box.T_world_object))
     )
     measurement, sums = _add(
-        state.fusing, state.measurement, state.sums, keyframe, T_object_world, state.place.frame,
-        state.place.lattice,
+        state.fusing, state.measurement, state.sums, keyframe._replace(parts=None), T_object_world,
+        state.place.frame, state.place.lattice,
     )  # fmt: skip
     return state._replace(measurement=measurement, sums=sums)
 

@@ -1,6 +1,7 @@
 """The object in the first frame that shows it: cut out, and its frame found. [host]
 
 find_start     which frame, which pixels, and where the object stands in the world
+on_the_floor   the same, once a later keyframe shows the floor
 placed_again   the same box, estimated from all keyframes so far
 """
 
@@ -14,9 +15,25 @@ from jaxtyping import Bool, Float
 from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Frame, Sequence, SequenceError
 from jaxshape.mapping.placement import placing
-from jaxshape.mapping.placement.placing import Placement
+from jaxshape.mapping.placement.faces import (
+    Cutout,
+    between,
+    cutouts,
+    faces_of,
+    fitted,
+    object_points,
+    tallest,
+)  # fmt: skip
+from jaxshape.mapping.placement.placing import Placement, turn
 from jaxshape.mapping.placement.rays import pooled, sample_rays
-from jaxshape.mapping.segmentation.planes import Floor, camera_points, dominant_planes, floor_plane
+from jaxshape.mapping.segmentation.planes import (
+    Floor,
+    Plane,
+    camera_points,
+    dominant_planes,
+    floor_plane,
+    height_above,
+)  # fmt: skip
 from jaxshape.mapping.segmentation.segment import Prompt, Segmentation, segment
 from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resized
 from jaxshape.model.shapes import ShapePrior
@@ -33,7 +50,9 @@ SURE_OF_FRONT = 0.01
 FIRST_FRAMES = 10
 """Frames among which the first that shows the object well is looked for."""
 
+_NEARLY_LEVEL = np.cos(np.radians(50))  # people tilt cameras down to look at things, by so much
 _FLOOR_MARGIN = 0.02  # metres above the floor below which nothing counts as the object
+_STEP = 0.04  # metres by which two floors differ that are not the same
 _ROOM = 0.15  # by which a box that was estimated is enlarged before the object is cut out with it
 
 
@@ -70,6 +89,15 @@ def room(start: Start) -> float:
     return 0.0 if start.T_level_world is None else _ROOM
 
 
+def with_room(start: Start) -> Box:
+    """The box that the object is cut out with.
+
+    Args:
+        start: The object, with its latest box.
+    """
+    return start.box._replace(size=(1 + room(start)) * start.box.size)
+
+
 def find_start(
     sequence: Sequence,
     prior: ShapePrior,
@@ -103,7 +131,7 @@ def find_start(
     """
     use_pose = use_pose and sequence.has_poses
     if box is not None:
-        index, frame = _first_readable(sequence, first, use_pose)
+        index, frame = first_readable(sequence, first, use_pose)
         T = _world_pose(frame, use_pose)
         return Start(index, frame.mask, box, T, None, np.nan, None, (), ())
     reasons = []
@@ -116,7 +144,7 @@ def find_start(
         if use_pose and frame.T_world_camera is None:
             reasons.append(f"{frame.name}: It has no pose.")
             continue
-        found = segment(frame.depth, frame.color, sequence.intrinsics, prompt, frame.mask)
+        found = segment(frame.depth, frame.color, frame.intrinsics, prompt, frame.mask)
         if found.confidence >= (SURE_OF_PROMPT if _is_prompted(prompt) else SURE):
             return _place_first(sequence, prior, index, frame, found, use_pose)
         reasons.append(f"{frame.name}: {found.reason}")
@@ -132,7 +160,17 @@ def _is_prompted(prompt: Prompt) -> bool:
     return prompt != Prompt()
 
 
-def _first_readable(sequence: Sequence, first: int, use_pose: bool) -> tuple[int, Frame]:
+def first_readable(sequence: Sequence, first: int, use_pose: bool) -> tuple[int, Frame]:
+    """The first frame from a number on that can be read, and its number.
+
+    Args:
+        sequence: The recording.
+        first: Number of the first frame to look at, from 0.
+        use_pose: Whether the frame has to have a pose.
+
+    Raises:
+        SequenceError: There is none.
+    """
     problem: Exception | None = None
     for index in range(first, len(sequence)):
         try:
@@ -160,13 +198,14 @@ def _place_first(
     use_pose: bool,
 ) -> Start:
     T_world_camera = _world_pose(frame, use_pose)
-    floor = _floor(frame, sequence, found)
+    floor = _floor(frame, found)
     up, of_up = _up(floor, T_world_camera, use_pose)
     cut = f"{frame.name}: {found.reason}"
-    doubts = [cut] * (found.confidence < SURE) + [of_up] * (floor is None)
+    is_doubtful = floor is None or floor.confidence < SURE
+    doubts = [cut] * (found.confidence < SURE) + [of_up] * is_doubtful
     T_level_world = np.eye(4)
     T_level_world[:3, :3] = _rotation_onto_y(up)
-    prepared = prepare(frame, sequence.intrinsics)
+    prepared = prepare(frame)
     start = Start(
         index=index,
         masked=found.segmented,
@@ -179,7 +218,7 @@ def _place_first(
         warnings=tuple(doubts),
     )
     masked = resized(found.segmented, prepared.view.depth.shape)
-    seen = (prepared.view.depth, masked, prepared.view.intrinsics, T_world_camera)
+    seen = Cutout(prepared.view.depth, masked, prepared.view.intrinsics, T_world_camera)
     start = _placed(start, prior, [seen])
     if start.placement is None:
         raise SequenceError(
@@ -197,8 +236,8 @@ def _with_doubt_of_front(start: Start) -> Start:
     return start._replace(notes=(*start.notes, doubt), warnings=(*start.warnings, doubt))
 
 
-def _floor(frame: Frame, sequence: Sequence, found: Segmentation) -> Floor | None:
-    points = camera_points(frame.depth, sequence.intrinsics)
+def _floor(frame: Frame, found: Segmentation) -> Floor | None:
+    points = camera_points(frame.depth, frame.intrinsics)
     known = frame.depth > 0
     planes = dominant_planes(points[known])
     return floor_plane(points[known], planes, points[found.segmented & known])
@@ -211,10 +250,24 @@ def _up(
     if floor is not None:
         up = T_world_camera[:3, :3] @ np.asarray(floor.plane.normal, np.float64)
         return up, f"Up is the normal of the floor ({floor.confidence:.0%} sure)."
+    of_camera = -T_world_camera[:3, 1]
     if has_poses:
-        return np.array([0.0, 1.0, 0.0]), "No floor is seen; the world's +y is taken as up."
-    up = -T_world_camera[:3, 1]
-    return up, "No floor is seen; the camera of the first frame is taken as held level."
+        axis, cosine = _nearest_axis(of_camera)
+        if cosine > _NEARLY_LEVEL:
+            name = "xyz"[int(np.argmax(np.abs(axis)))]
+            sign = "+" if axis.sum() > 0 else "-"
+            return axis, (
+                f"No floor is seen; the world's {sign}{name} is taken as up, the axis nearest to "
+                "the image's."
+            )
+    return of_camera, "No floor is seen; the camera of the first frame is taken as held level."
+
+
+def _nearest_axis(up: Float[np.ndarray, " 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    """The axis of the world, of either sign, nearest to a direction, and the cosine to it."""
+    axis = np.zeros(3)
+    axis[np.argmax(np.abs(up))] = np.sign(up[np.argmax(np.abs(up))])
+    return axis, float(axis @ up)
 
 
 def _floor_height(floor: Floor | None, T_level_camera: Float[np.ndarray, "4 4"]) -> float:
@@ -235,34 +288,116 @@ def _rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     return np.stack([np.cross(y, z), y, z])
 
 
+# A floor that is seen later ---------------------------------------------------------------------
+
+
+def on_the_floor(start: Start, keyframes: tuple[Keyframe, ...]) -> Start:
+    """The start on the floor that the keyframes show; as it is where they show no better one.
+
+    Of several floors the surest counts, if all that was measured of the object lies above it, and
+    no higher than the prior's largest objects reach.
+
+    Args:
+        start: The object, with its latest box.
+        keyframes: The keyframes of the map.
+
+    Returns:
+        The start with its up and its box as the floor asks; the same one where nothing changes.
+    """
+    assert start.T_level_world is not None
+    points = object_points(cutouts(keyframes))
+    floors = [_floor_of(one, points) for one in keyframes if one.parts is not None]
+    sure = [one for one in floors if one.confidence >= SURE]
+    if not sure:
+        return start
+    best = max(sure, key=lambda one: one.confidence)
+    if abs(_height_at(best.plane, start) - start.floor) < _STEP:  # False for NaN
+        return start
+    return _standing_on(start, best.plane)
+
+
+def _height_at(floor: Plane, start: Start) -> float:
+    """Height, in the level frame, of a floor below the middle of the box."""
+    assert start.T_level_world is not None
+    middle = start.box.T_world_object[:3, 3]
+    below = middle - height_above(floor, middle) * floor.normal
+    return float((start.T_level_world[:3, :3] @ below + start.T_level_world[:3, 3])[1])
+
+
+def _floor_of(keyframe: Keyframe, points: Float[np.ndarray, "n 3"]) -> Floor:
+    """The floor of a keyframe in the world, and how sure it is that the object stands on it."""
+    assert keyframe.parts is not None
+    T = np.asarray(keyframe.T_world_camera.as_matrix(), np.float64)
+    normal = T[:3, :3] @ keyframe.parts.floor[:3]
+    offset = float(keyframe.parts.floor[3] - normal @ T[:3, 3])
+    plane = Plane(normal, offset, 0.0)
+    height = height_above(plane, points)
+    if not len(points) or not np.isfinite(offset):
+        return Floor(plane, 0.0)
+    below = float(np.clip(1 - np.mean(height < -_STEP) / 0.05, 0, 1))
+    within = np.percentile(height, 99) < tallest()
+    return Floor(plane, keyframe.parts.evidence * below * within)
+
+
+def _standing_on(start: Start, floor: Plane) -> Start:
+    """The start in a level frame whose up is the normal of a floor, with the box standing on it."""
+    assert start.T_level_world is not None
+    T_level_world = np.eye(4)
+    T_level_world[:3, :3] = _rotation_onto_y(np.asarray(floor.normal, np.float64))
+    T_level_object = T_level_world @ start.box.T_world_object
+    front = T_level_object[:3, 2]
+    T_level_object[:3, :3] = np.asarray(turn(jnp.arctan2(front[0], front[2])), np.float64)
+    box = Box(np.linalg.inv(T_level_world) @ T_level_object, start.box.size)
+    height = -floor.offset  # of the floor, along its normal, from the origin
+    lower, upper = -box.size / 2, box.size / 2
+    lower[1] = height - T_level_object[1, 3]
+    said = "Up and the floor are those of a later keyframe, the first that shows them well."
+    kept = tuple(one for one in start.warnings if one not in start.notes[:2])
+    start = start._replace(
+        T_level_world=T_level_world,
+        floor=height,
+        notes=tuple(dict.fromkeys((*start.notes, said))),
+        warnings=kept,
+    )
+    return _in_box(start, _without_floor(between(box, lower, upper), height))
+
+
 # Placement --------------------------------------------------------------------------------------
 
 
 def placed_again(start: Start, prior: ShapePrior, keyframes: tuple[Keyframe, ...]) -> Start:
     """The start with its box estimated from all keyframes, beginning at its earlier placement."""
-    seen = [
-        (one.depth, one.segmented, one.intrinsics, np.asarray(one.T_world_camera.as_matrix()))
-        for one in keyframes
-    ]
-    return _placed(start, prior, seen)
+    return _placed(start, prior, cutouts(keyframes))
 
 
-def _placed(start: Start, prior: ShapePrior, frames: list) -> Start:
-    """The start with the box that the prior finds; as it is where nothing can be placed."""
+def _placed(start: Start, prior: ShapePrior, frames: list[Cutout]) -> Start:
+    """The start with the box that the prior finds; as it is where nothing can be placed.
+
+    Its faces lie where the object was seen to end.
+    """
     assert start.T_level_world is not None
     known = start.placement or placing.nothing_known(prior)
     each = [
-        _sample_rays(jax.random.key(number), depth, masked, intrinsics)
+        _sample_rays(jax.random.key(number), jnp.asarray(depth), jnp.asarray(masked), intrinsics)
         for number, (depth, masked, intrinsics, _) in enumerate(frames)
     ]
-    poses = [as_pose(start.T_level_world @ T_world_camera) for *_, T_world_camera in frames]
+    poses = [as_pose(start.T_level_world @ one.T_world_camera) for one in frames]
     seen = _pooled(_stacked(each), _stacked(poses))
     found = _place(prior, seen, jnp.float32(start.floor), known)
     if not np.isfinite(found.misfit):
         return start
     T_level_object = np.asarray(found.T_world_object.as_matrix(), np.float64)
     box = Box(np.linalg.inv(start.T_level_world) @ T_level_object, np.asarray(found.size, float))
-    return start._replace(placement=found, box=_without_floor(box, start.floor))
+    box = _without_floor(box, start.floor)
+    return _in_box(start._replace(placement=found), fitted(box, faces_of(box, frames)))
+
+
+def _in_box(start: Start, box: Box) -> Start:
+    """The start with its box, and its placement in the same one."""
+    assert start.placement is not None and start.T_level_world is not None
+    T_level_object = as_pose(start.T_level_world @ box.T_world_object)
+    found = start.placement._replace(T_world_object=T_level_object, size=jnp.float32(box.size))
+    return start._replace(placement=found, box=box)
 
 
 def _stacked(trees: list[Any]) -> Any:

@@ -162,7 +162,8 @@ def propose(seen: RaySamples, floor: Float[Array, ""], config: PlacementConfig) 
     Args:
         seen: Points on the object, and points that rays passed.
         floor: Height of the floor, on which the bottom of the boxes lies, in metres; NaN where it
-            is not known: the bottom then lies where the points end.
+            is not known: the bottom then lies where the points end, or below, as far as a side
+            that faces away.
         config: Settings of the placement.
     """
     yaw = jnp.arange(config.yaws) * (2 * jnp.pi / config.yaws)
@@ -171,6 +172,7 @@ def propose(seen: RaySamples, floor: Float[Array, ""], config: PlacementConfig) 
     lower, upper = ordered[:, stray], ordered[:, -1 - stray]
     # Seen at 45 degrees all four sides end within sight, hence the square.
     away = jnp.array([1.0, 0.0, 1.0]) * (seen.away @ turn(yaw))
+    away = away.at[:, 1].set(jnp.where(jnp.isnan(floor), -1.0, 0.0))  # legs out of sight
     typical = jnp.mean(jnp.array(config.typical_size)[::2])
     overhang = typical * jnp.array(config.overhangs)[:, None, None]
     lower = lower - overhang * jnp.minimum(away, 0) ** 2

@@ -39,6 +39,12 @@ HIDDEN = 0.4
 GROWTH = 0.1
 """Largest distance of legs outside the footprint of the parts above them, in metres."""
 
+MOST = 9
+"""Groups of clusters that are proposed as objects."""
+
+SPECK = 0.003
+"""Share of the image below which a group of clusters is not proposed."""
+
 SMALLEST = 12
 """Clusters of fewer pixels are noise."""
 
@@ -71,9 +77,17 @@ class Scene(NamedTuple):
         return self.points[..., 2]
 
 
-def look(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> Scene:
-    """The reduced frame, its planes, and the floor among them."""
-    stride = max(1, round(depth.shape[1] / WORKING_WIDTH))
+def look(
+    depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"], stride: int | None = None
+) -> Scene:
+    """The reduced frame, its planes, and the floor among them.
+
+    Args:
+        depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
+        K: Camera matrix `[3 3]`, in pixels.
+        stride: Of this many rows and columns one is kept; None for about the working width.
+    """
+    stride = stride or max(1, round(depth.shape[1] / WORKING_WIDTH))
     points = reduced(camera_points(depth, K), stride)
     cloud = points.reshape(-1, 3)
     planes = dominant_planes(cloud)
@@ -198,7 +212,8 @@ def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
     Clusters belong together if most of one stands on the footprint of the other, which is no larger
     than furniture, or if one is much smaller and next to the other in space.
     """
-    clouds = {label: view.points[labels == label] for label in range(1, labels.max() + 1)}
+    present = np.unique(labels[labels > 0]).tolist()
+    clouds = {label: view.points[labels == label] for label in present}
     chosen, others = [main], set(clouds) - {main}
     while True:
         body = np.concatenate([clouds[label] for label in chosen])
@@ -206,6 +221,19 @@ def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
         if not new:
             return chosen
         chosen, others = chosen + new, others - set(new)
+
+
+def groups(labels: Int[np.ndarray, "h w"], view: Scene) -> list[list[int]]:
+    """The largest clusters, each with those that belong to it and to no larger one."""
+    sizes = np.bincount(labels.ravel())[1:]
+    found, left = [], labels.copy()
+    for seed in np.argsort(-sizes, kind="stable")[: 4 * MOST] + 1:
+        if (left == seed).any():
+            found.append(joined(left, int(seed), view))
+            left[np.isin(left, found[-1])] = 0
+    total = {tuple(group): sizes[np.array(group) - 1].sum() for group in found}
+    found = [group for group in found if total[tuple(group)] >= SPECK * labels.size]
+    return sorted(found, key=lambda group: -total[tuple(group)])[:MOST]
 
 
 def _belongs(

@@ -11,11 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.ndimage import mean
-from scipy.spatial import KDTree
 
 from jaxshape import checks
-from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.mapping.segmentation.clusters import (
     Pixel,
     Scene,
@@ -24,6 +21,7 @@ from jaxshape.mapping.segmentation.clusters import (
     cut,
     distance,
     enlarged,
+    groups,
     joined,
     look,
     reduced,
@@ -33,15 +31,6 @@ from jaxshape.mapping.segmentation.feet import feet_on
 
 CLICK_RADIUS = 4.0
 """Radius around a click in which the object may lie, in pixels of the reduced image."""
-
-MOSTLY = 0.5
-"""Share of a cluster that must lie in the object's box to be part of it."""
-
-NEAR = 0.03
-"""Metres within which two frames have measured the same thing."""
-
-NOTHING = np.zeros((0, 3))
-"""No points."""
 
 CANDIDATES = 5
 """Clusters that are joined with what belongs to them before one is chosen."""
@@ -70,6 +59,8 @@ class Prompt:
         region: `(left, top, right, bottom)` around the object, in pixels; None for the whole image.
         depth_range: Nearest and farthest depth of the object, in metres, 0 or more; None for any
             depth.
+        number: Number of the object, from 1, among those that `propose` finds in the same image;
+            None for no number.
 
     Raises:
         ValueError: A coordinate is outside its range, or an interval is empty.
@@ -78,6 +69,7 @@ class Prompt:
     click: tuple[float, float] | None = None
     region: tuple[float, float, float, float] | None = None
     depth_range: tuple[float, float] | None = None
+    number: int | None = None
 
     def __post_init__(self) -> None:
         for coordinate in self.click or ():
@@ -90,6 +82,8 @@ class Prompt:
         if not 0 <= near < far:
             wanted = "the nearest, then the farthest depth, in metres"
             checks.refuse("depth_range", self.depth_range, wanted)
+        if self.number is not None:
+            checks.whole("number", self.number, 1)
 
 
 def segment(
@@ -116,7 +110,7 @@ def segment(
         mask: True on the object `[h w]`; None to find it.
 
     Raises:
-        ValueError: No pixel of the image can meet the prompt.
+        ValueError: No pixel of the image can meet the prompt, or no object has its number.
     """
     check_prompt(prompt, depth.shape)
     measured = (depth > 0) & np.isfinite(depth)
@@ -132,46 +126,16 @@ def segment(
     labels = clusters(view, reduced(allowed, view.stride) & ~behind)
     if labels.max() == 0:
         return _nothing(measured, "Nothing but floor, walls and table tops is seen there")
-    chosen, doubt = (_nearest if clicked else _most_central)(labels, view, target)
+    if prompt.number is not None:
+        chosen, doubt = _numbered(labels, view, prompt.number)
+    else:
+        chosen, doubt = (_nearest if clicked else _most_central)(labels, view, target)
     segmented = np.isin(labels, chosen)
     if color is not None and view.floor is not None:
         segmented |= feet_on(segmented, reduced(color, view.stride), view, view.floor.plane)
-    doubts = [doubt, *doubts_of(segmented, behind, view, clicked=clicked)]
+    is_told = clicked or prompt.number is not None
+    doubts = [doubt, *doubts_of(segmented, behind, view, clicked=is_told)]
     return Segmentation(enlarged(segmented, view, depth) & allowed, *judged(doubts, len(chosen)))
-
-
-def segment_inside(
-    depth: Float[np.ndarray, "h w"],
-    K: Float[np.ndarray, "3 3"],
-    box: Box,
-    T_world_camera: Float[np.ndarray, "4 4"],
-    others: Float[np.ndarray, "n 3"] = NOTHING,
-) -> Bool[np.ndarray, "h w"]:
-    """Find the pixels of a later frame that show the object, of which a box is known. [host]
-
-    Clusters count that lie mostly in the box and mostly not where earlier frames saw other things:
-    a table that reaches into the box is left out, and parts of the object outside of it are not
-    lost.
-
-    Args:
-        depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
-        K: Camera matrix `[3 3]`, in pixels.
-        box: The object's box in the world.
-        T_world_camera: Pose of the frame `[4 4]`.
-        others: World points at which earlier frames saw other things `[n 3]`, in metres.
-    """
-    view = look(depth, K)
-    known = np.isfinite(view.z)
-    points = view.points[known] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    ours = points_in_box(points, box)
-    if len(others):
-        ours &= np.isinf(KDTree(others).query(points, distance_upper_bound=NEAR)[0])
-    inside = np.zeros(known.shape, bool)
-    inside[known] = ours
-    labels = clusters(view, known & ~background(view, None))
-    shares = np.asarray(mean(inside, labels, np.arange(labels.max() + 1)))
-    chosen = np.flatnonzero(shares > MOSTLY)
-    return enlarged(np.isin(labels, chosen[chosen > 0]), view, depth)
 
 
 def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:
@@ -246,6 +210,17 @@ def _nearest(labels: Int[np.ndarray, "h w"], view: Scene, target: Pixel) -> tupl
     ]
     hit = np.argmin(depths) if np.isfinite(depths).any() else np.argmin(away)
     return joined(labels, int(hit) + 1, view), doubt
+
+
+def _numbered(labels: Int[np.ndarray, "h w"], view: Scene, number: int) -> tuple[list[int], Doubt]:
+    """The group of clusters of this number, which a user chose from a picture of them."""
+    found = groups(labels, view)
+    if number > len(found):
+        raise ValueError(
+            f"The object has the number {number}, and {len(found)} are seen there; see them with "
+            "--list."
+        )
+    return found[number - 1], (1.0, "it was chosen")
 
 
 def _most_central(

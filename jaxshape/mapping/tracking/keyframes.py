@@ -15,6 +15,7 @@ from jaxshape.data.sequences import Frame
 from jaxshape.geometry import grid
 from jaxshape.geometry.camera import Intrinsics, intrinsics_of
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.mapping.segmentation.parts import Parts
 from jaxshape.mapping.tracking import icp
 from jaxshape.mapping.tracking.icp import Cloud
 from jaxshape.mapping.tracking.surfels import CELLS, Lattice
@@ -46,15 +47,17 @@ class PreparedFrame(NamedTuple):
         view: Depth image at working size, with its oriented points.
         masked: Pixels that may show the object `[h w]`: a given mask, or all.
         recorded: The depth image in full size; None where that is the working size.
+        parts: Parts that the image falls into; None where the box alone tells the object.
     """
 
     view: DepthView
     masked: Bool[Array, "h w"]
     recorded: DepthImage | None = None
+    parts: Parts | None = None
 
 
-# Pixels that may show the object, from its box and the pose of the camera, both in the world.
-Cut = Callable[[Box, jaxlie.SE3], Bool[Array, "h w"]]
+# The parts of a frame, and the pixels that show the object, from the pose of the camera.
+Cut = Callable[[jaxlie.SE3], tuple[Parts, Bool[Array, "h w"]]]
 
 
 class Keyframe(NamedTuple):
@@ -72,6 +75,7 @@ class Keyframe(NamedTuple):
         information: Inverse covariance of that relative pose `[6 6]`, in the frame of the keyframe
             before; 0 for the first.
         recorded: The depth image in full size, which is fused; None where that is the working size.
+        parts: Parts that the image falls into; None where the box alone tells the object.
     """
 
     depth: Float[Array, "h w"]
@@ -83,6 +87,7 @@ class Keyframe(NamedTuple):
     T_previous_keyframe: jaxlie.SE3
     information: Float[Array, "6 6"]
     recorded: DepthImage | None = None
+    parts: Parts | None = None
 
 
 class Place(NamedTuple):
@@ -153,6 +158,7 @@ def keyframe_of(
         T_previous_keyframe=T_previous,
         information=information,
         recorded=prepared.recorded,
+        parts=prepared.parts,
     )
 
 
@@ -166,10 +172,13 @@ def to_fuse(keyframe: Keyframe) -> tuple[DepthImage, Bool[Array, "h w"]]:
     return keyframe.recorded, jnp.pad(segmented, missing)
 
 
-def cut_anew(keyframe: Keyframe, place: Place) -> Keyframe:
-    """The keyframe with the object cut out of it by another box."""
+def cut_anew(
+    keyframe: Keyframe, place: Place, segmented: Bool[Array, "h w"] | None = None
+) -> Keyframe:
+    """The keyframe with the object cut out of it by another box, or with these pixels of it."""
     prepared = PreparedFrame(view_again(keyframe.depth, keyframe.intrinsics), keyframe.masked)
-    segmented = object_pixels(prepared, place, keyframe.T_world_camera)
+    if segmented is None:
+        segmented = object_pixels(prepared, place, keyframe.T_world_camera)
     return keyframe._replace(segmented=segmented, cloud=_cloud(prepared.view, segmented))
 
 
@@ -191,20 +200,17 @@ view_again = jax.jit(view_of)
 # Frames ------------------------------------------------------------------------------------------
 
 
-def prepare(
-    frame: Frame, K: Float[np.ndarray, "3 3"], masked: Bool[np.ndarray, "h w"] | None = None
-) -> PreparedFrame:
+def prepare(frame: Frame, masked: Bool[np.ndarray, "h w"] | None = None) -> PreparedFrame:
     """A frame at working size, with its oriented points.
 
     Args:
         frame: The frame.
-        K: Camera matrix `[3 3]`, in pixels.
         masked: Pixels that may show the object, in place of its own mask; None for that mask.
     """
     halvings = 0
     while frame.depth.shape[1] >> halvings > WORKING_WIDTH:
         halvings += 1
-    image = DepthImage(jnp.asarray(frame.depth), intrinsics_of(K))
+    image = DepthImage(jnp.asarray(frame.depth), intrinsics_of(frame.intrinsics))
     view = _view(*image, halvings)
     mask = frame.mask if masked is None else masked
     shape = view.depth.shape

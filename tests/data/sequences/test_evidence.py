@@ -1,42 +1,53 @@
-"""Poses the wrong way round."""
+"""Pairs of frames and the share of pixels on which they agree."""
 
 import numpy as np
-from recordings import record, save, write_7_scenes
+import pytest
+from recordings import K, record, save, write_7_scenes
 
-from jaxshape.data.sequences import open_sequence, pose_agreement, poses_look_inverted
+from jaxshape.data.sequences import open_sequence
+from jaxshape.data.sequences.evidence import agreement, seen_by, telling_pairs
 
 SEEN = record(12)
 
 
-def write_room(folder, *, invert):
-    poses = np.linalg.inv(SEEN.T_world_camera) if invert else SEEN.T_world_camera
+def pairs_of(folder, poses=SEEN.T_world_camera):
     write_7_scenes(folder, SEEN._replace(T_world_camera=poses))
-    return open_sequence(folder)
+    return telling_pairs(open_sequence(folder))
 
 
-def test_inverted_poses_are_noticed_and_right_ones_are_not(tmp_path):
-    right = write_room(tmp_path / "right", invert=False)
-    wrong = write_room(tmp_path / "wrong", invert=True)
-    assert not poses_look_inverted(right) and poses_look_inverted(wrong)
-    there, back = pose_agreement(right), pose_agreement(wrong)
-    assert there.as_given > 0.8 and there.pairs > 3
-    np.testing.assert_allclose((back.inverted, back.as_given), there[:2], atol=1e-6)
+def test_pairs_do_not_depend_on_how_poses_are_written(tmp_path):
+    right = pairs_of(tmp_path / "a")
+    wrong = pairs_of(tmp_path / "b", np.linalg.inv(SEEN.T_world_camera))
+    assert len(right) == len(wrong) > 3
+    for one, other in zip(right, wrong, strict=True):
+        np.testing.assert_array_equal(one.depth_b, other.depth_b)
+    there, back = seen_by(right, K), seen_by(wrong, K)
+    assert agreement(there, K) > 0.95 and agreement(back, K) < 0.5
+    assert agreement(back, K, ("inverted",)) == pytest.approx(agreement(there, K), abs=1e-6)
 
 
-def test_a_sequence_that_cannot_tell_is_not_accused(tmp_path):
-    write_7_scenes(tmp_path, SEEN._replace(depth=SEEN.depth[:1], T_world_camera=np.eye(4)[None]))
-    assert not poses_look_inverted(open_sequence(tmp_path))  # one frame
-    rest = np.tile(np.eye(4), (4, 1, 1))
-    write_7_scenes(tmp_path, SEEN._replace(depth=SEEN.depth[:4], T_world_camera=rest))
-    assert pose_agreement(open_sequence(tmp_path)).pairs == 0  # a camera at rest
+def test_poses_and_depth_that_grow_together_agree_as_before(tmp_path):
+    poses = SEEN.T_world_camera.copy()
+    seen = seen_by(pairs_of(tmp_path / "a", poses), K)
+    poses[:, :3, 3] /= 4
+    smaller = seen_by(pairs_of(tmp_path / "b", poses), K)
+    assert agreement(smaller, K, longer=4.0) == pytest.approx(agreement(seen, K), abs=1e-6)
+    assert agreement(smaller, K) < agreement(seen, K) - 0.05
+
+
+def test_poses_that_turn_the_camera_away_win_nothing(tmp_path):
+    poses = SEEN.T_world_camera.copy()
+    poses[::2, :3, 3] += [0, 0, 50]
+    seen = seen_by(pairs_of(tmp_path, poses), K)
+    assert agreement(seen, K) < 0.5
 
 
 def test_frames_without_pose_or_image_are_passed_over(tmp_path):
-    sequence = write_room(tmp_path, invert=True)
-    pairs = pose_agreement(sequence).pairs
+    count = len(pairs_of(tmp_path))
     (tmp_path / "frame-000000.pose.txt").unlink()
     (tmp_path / "frame-000006.depth.png").write_bytes(b"")
     (tmp_path / "frame-000003.pose.txt").write_text("no matrix")
     save(tmp_path / "frame-000011.depth.png", np.zeros((48, 64), np.uint16))
-    sequence = open_sequence(tmp_path)
-    assert 0 < pose_agreement(sequence).pairs < pairs and poses_look_inverted(sequence)
+    pairs = telling_pairs(open_sequence(tmp_path))
+    assert 0 < len(pairs) < count and agreement(seen_by(pairs, K), K) > 0.9
+    assert agreement((), K) == 0

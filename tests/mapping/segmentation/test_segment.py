@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from analytic_room import CHAIR, CRATE, FLOOR, HEIGHT, TABLE, WALLS, WIDTH, K, iou, room
 
-from jaxshape.data.boxes import Box
-from jaxshape.mapping.segmentation.segment import Prompt, segment, segment_inside
+from jaxshape.mapping.segmentation.segment import Prompt, segment
 
 GROUPS = [FLOOR, WALLS, CHAIR, CRATE, TABLE]
 COLORS = np.array([[90, 90, 95], [200, 190, 180], [120, 60, 30], [40, 90, 160], [30, 120, 60]])
@@ -168,21 +167,3 @@ def test_what_is_hidden_or_cut_is_less_sure(seen):
 def test_prompts_that_cannot_be_met_are_named(seen, prompt, said):
     with pytest.raises(ValueError, match=said):
         segment(seen.depth, None, K, prompt)
-
-
-def test_a_known_box_segments_what_lies_mostly_in_it(seen):
-    T_world_box = np.eye(4)
-    T_world_box[1, 3] = 0.475
-    truth = seen.label == 2
-    exact = Box(T_world_box, np.array([0.48, 1.0, 0.48]))
-    assert iou(segment_inside(seen.depth, K, exact, seen.T_world_camera), truth) > 0.9
-    # A box that is too small, or reaches into other things, still means the same object.
-    for size in ([0.4, 0.9, 0.4], [0.7, 1.2, 0.7]):
-        found = segment_inside(seen.depth, K, Box(T_world_box, np.array(size)), seen.T_world_camera)
-        assert iou(found, truth) > 0.9
-
-    elsewhere = T_world_box.copy()
-    elsewhere[0, 3] += 3
-    far = Box(elsewhere, exact.size)
-    assert not segment_inside(seen.depth, K, far, seen.T_world_camera).any()
-    assert not segment_inside(0 * seen.depth, K, exact, seen.T_world_camera).any()

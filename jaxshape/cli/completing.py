@@ -1,0 +1,103 @@
+"""`jaxshape complete`: one object from a point cloud or a fused model."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from tyro.conf import Positional
+
+from jaxshape.cli.common import console, require
+from jaxshape.cli.rebuild import Rebuild, report_objective
+from jaxshape.data.config import Axis
+
+
+@dataclass(frozen=True, kw_only=True)
+class Complete(Rebuild):
+    """Complete a point cloud or a fused model of one object, which holds nothing else.
+
+    Which way is up and to the front is found by the prior, among the axes of the file. What is free
+    is known by rays from --sensor to the points or, less of it, by normals in the file; without
+    both, what is not measured is all predicted.
+
+    Examples: jaxshape complete scan.ply
+
+    jaxshape complete scan.pcd --up z --front -y --sensor 0 0 0
+    """
+
+    scan: Positional[Path]
+    """A .ply file of points, with normals or without, or of triangles; or a .pcd file."""
+    up: Axis | None = None
+    """Axis of the file that points up; found by default."""
+    front: Axis | None = None
+    """Axis of the file along which the object's front looks; found by default."""
+    sensor: tuple[float, float, float] | None = None
+    """Where the sensor was, in the frame and the unit of the file, if it saw all from there; a .pcd
+    file may say it by itself."""
+    output: Path = Path("out/complete")
+    """Folder for mesh.glb (in metres), mesh.ply (in the frame and the unit of the file), grid.npz,
+    result.json, overview.png and report.html."""
+
+    def run(self) -> None:
+        start = time.perf_counter()
+        import jax
+        import numpy as np
+
+        from jaxshape.data.clouds import read_cloud
+        from jaxshape.mapping.placement.cloud_placing import cloud_grids, place_cloud
+        from jaxshape.mapping.tracking.keyframes import place_of
+        from jaxshape.report.page import write_report
+        from jaxshape.report.panels import write_overview
+        from jaxshape.results.output import Observation, write_result
+        from jaxshape.search.reconstruction import reconstruct_jit, require_measured
+
+        require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
+        cloud = read_cloud(self.scan, seed=self.seed)
+        if self.sensor is not None:
+            require(bool(np.isfinite(self.sensor).all()), "--sensor is not finite; give x y z.")
+            cloud = cloud._replace(sensor=np.array(self.sensor))
+        prior, refiner, config = self.prepare()
+        with console.status("finding which way is up"):
+            placed = place_cloud(cloud, prior, up=self.up, front=self.front, seed=self.seed)
+        warnings = [*placed.warnings, *_of_rays(cloud)]
+        for warning in warnings:
+            console.print(f"[yellow]warning[/] {escape(warning)}", highlight=False, soft_wrap=True)
+        frame = place_of(placed.box, prior.resolution).frame
+        grids = cloud_grids(cloud, placed, frame, prior.resolution, seed=self.seed)
+        require_measured(np.asarray(grids.occupied))
+        with console.status("searching the space of shapes"):
+            run = reconstruct_jit(refiner, config)
+            key = jax.random.key(self.seed)[None]
+            found = run(key, prior, grids.occupied[None], grids.occluded[None])
+            found = jax.block_until_ready(found)
+        T = placed.box.T_world_object
+        observation = Observation(
+            depth=[],
+            occupied=np.asarray(grids.occupied),
+            occluded=np.asarray(grids.occluded),
+            frame=frame,
+            T_world_object=np.diag([1 / placed.metres] * 3 + [1.0]) @ T,
+            truth=None,
+        )
+        figures: dict[str, Any] = {"object": str(self.scan), **self.settings("points")}
+        figures |= {"points": len(cloud.points), "up": placed.up, "metres_in_a_unit": placed.metres}
+        figures["box"] = {"T_world_object": T.tolist(), "size": placed.box.size.tolist()}
+        figures |= {"warnings": warnings, "seconds": round(time.perf_counter() - start, 2)}
+        with console.status("drawing"):
+            result = write_result(self.output, observation, found, figures)
+            write_overview(self.output, observation, found, result)
+            write_report(self.output)
+        size = " x ".join(f"{extent:.2f}" for extent in placed.box.size)
+        print(f"{len(cloud.points)} points of an object of {size} m, {placed.up} is up")
+        report_objective(result)
+        print(f"wrote mesh.glb, mesh.ply, result.json, overview.png, report.html to {self.output}")
+
+
+def _of_rays(cloud: Any) -> list[str]:
+    if cloud.sensor is not None or cloud.normals is not None:
+        return []
+    return [
+        "Neither the sensor's position nor normals are known, so that holes cannot be told from "
+        "what was not seen; give --sensor, or a file with normals."
+    ]

@@ -1,0 +1,140 @@
+"""Point clouds and fused models of one object, from PLY and PCD files. [host]"""
+
+import io
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from jaxshape.data.archives import Beside, MeshSource, read_bytes
+from jaxshape.data.meshes import MAX_FACES, sample_oriented
+from jaxshape.data.pcd import parse_pcd
+
+SUFFIXES = (".ply", ".pcd")
+
+MAX_POINTS = 200_000
+"""Points that are kept; of more, as many are drawn."""
+
+FEWEST = 100
+"""Points below which there is no shape to complete."""
+
+
+class Cloud(NamedTuple):
+    """Points on the surface of one object, in a frame and a unit of their own.
+
+    Attributes:
+        points: The points `[n 3]`.
+        normals: Directions out of the surface `[n 3]`, of length 1; None where they are not known.
+        sensor: Where the sensor was, from which all points were seen `[3]`; None where that is not
+            known.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"] | None
+    sensor: Float[np.ndarray, " 3"] | None
+
+
+def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
+    """Read a point cloud or a fused model.
+
+    A model of triangles gives points all over its surface, with its normals. Points that are not
+    finite are left out, and normals where one of them has no length.
+
+    Args:
+        path: A `.ply` or `.pcd` file.
+        seed: Seed of the draw of points, 0 or more.
+
+    Returns:
+        Up to `MAX_POINTS` points, with their normals and the sensor's position where the file has
+        them.
+
+    Raises:
+        ValueError: The file is of another kind, damaged, or holds too few points.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in SUFFIXES:
+        raise ValueError(f"{path} is no point cloud; expected {' or '.join(SUFFIXES)}: convert it.")
+    try:
+        content = read_bytes(MeshSource(path.stem, str(path)))
+        found = _read_ply(content, path, seed) if kind == ".ply" else _read_pcd(content)
+    except Exception as error:  # parsers of foreign files fail in any way there is
+        reason = " ".join(f"{error or type(error).__name__}".split())[:300]
+        raise ValueError(
+            f"{path} cannot be read as a point cloud ({reason}); expected a whole PLY or PCD file: "
+            "save it again."
+        ) from error
+    cloud = _drawn(_finite(found), seed)
+    if len(cloud.points) < FEWEST or np.ptp(cloud.points, axis=0).max() == 0:
+        raise ValueError(
+            f"{path} holds {len(cloud.points)} usable points; expected {FEWEST} or more, of one "
+            "object."
+        )
+    return cloud
+
+
+def _read_ply(content: bytes, path: Path, seed: int) -> Cloud:
+    loaded: Any = trimesh.load(
+        io.BytesIO(content),
+        file_type="ply",
+        resolver=Beside(MeshSource(path.stem, str(path))),
+        process=False,
+        skip_materials=True,
+    )
+    if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
+        return _from_faces(loaded, seed)
+    points = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
+    columns = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    return Cloud(points, _normals_of(columns, len(points)), None)
+
+
+def _from_faces(mesh: trimesh.Trimesh, seed: int) -> Cloud:
+    if len(mesh.faces) > MAX_FACES:
+        raise ValueError(f"it has {len(mesh.faces)} faces, more than {MAX_FACES}")
+    corners = mesh.vertices[mesh.faces]
+    area = trimesh.triangles.area(corners)
+    used = np.isfinite(corners).all(axis=(1, 2)) & (area > 0)
+    if not used.any() or not np.isfinite(area[used].sum()):
+        raise ValueError("its triangles have no area")
+    usable = trimesh.Trimesh(mesh.vertices, mesh.faces[used], process=False)
+    return Cloud(*sample_oriented(usable, MAX_POINTS, seed), None)
+
+
+def _read_pcd(content: bytes) -> Cloud:
+    values, viewpoint = parse_pcd(content)
+    if missing := [axis for axis in "xyz" if axis not in values]:
+        raise ValueError(f"it has no field {missing[0]}")
+    points = np.stack([values[axis] for axis in "xyz"], axis=-1)
+    return Cloud(points, _normals_of(values, len(points)), viewpoint)
+
+
+def _normals_of(columns: Any, count: int) -> Float[np.ndarray, "n 3"] | None:
+    """Normals from fields of the names that PLY (nx) or PCD (normal_x) give them."""
+    names = getattr(getattr(columns, "dtype", None), "names", None) or tuple(columns)
+    for pattern in ("n{}", "normal_{}"):
+        wanted = [pattern.format(axis) for axis in "xyz"]
+        if all(name in names for name in wanted):
+            normals = np.stack([np.ravel(columns[name]) for name in wanted], axis=-1)
+            return normals.astype(np.float64) if normals.shape == (count, 3) else None
+    return None
+
+
+def _finite(cloud: Cloud) -> Cloud:
+    kept = np.isfinite(cloud.points).all(axis=1) & (np.abs(cloud.points) < 1e9).all(axis=1)
+    normals = None if cloud.normals is None else cloud.normals[kept]
+    if normals is not None:
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        is_known = np.isfinite(lengths).all() and (lengths > 1e-6).all()
+        normals = normals / lengths if is_known else None
+    return Cloud(cloud.points[kept], normals, cloud.sensor)
+
+
+def _drawn(cloud: Cloud, seed: int) -> Cloud:
+    if len(cloud.points) <= MAX_POINTS:
+        return cloud
+    chosen = np.random.default_rng(seed).permutation(len(cloud.points))[:MAX_POINTS]
+    normals = None if cloud.normals is None else cloud.normals[chosen]
+    return Cloud(cloud.points[chosen], normals, cloud.sensor)

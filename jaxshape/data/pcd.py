@@ -1,0 +1,144 @@
+"""Point clouds of the Point Cloud Library: ascii, binary and binary_compressed. [host]"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+MAX_POINTS = 100_000_000
+"""Most points of a file."""
+
+_ENTRIES = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+_KINDS = {"F": "f", "I": "i", "U": "u"}
+
+
+class Columns(NamedTuple):
+    """The fields of a file.
+
+    Attributes:
+        values: The numbers of each field `[n]`, by its name.
+        viewpoint: Where the sensor was `[3]`; None where the file does not say, as it does not with
+            the default, the origin.
+    """
+
+    values: dict[str, Float[np.ndarray, " n"]]
+    viewpoint: Float[np.ndarray, " 3"] | None
+
+
+def parse_pcd(content: bytes) -> Columns:
+    """Read the fields of a PCD file, as float64.
+
+    Args:
+        content: The whole file.
+
+    Raises:
+        ValueError: The file is damaged, or a field has several numbers of each point that are used.
+    """
+    header, body = _header(content)
+    names, kinds, counts = header["FIELDS"], _kinds(header), _counts(header)
+    count = int(header.get("POINTS", header["WIDTH"])[0])
+    if not 0 <= count <= MAX_POINTS:
+        raise ValueError(f"it holds {count} points; expected 0 to {MAX_POINTS}")
+    row = np.dtype(
+        [(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))]
+    )
+    how = header["DATA"][0].lower()
+    if how == "ascii":
+        columns = _ascii(body, counts, count)
+    elif how == "binary":
+        table = np.frombuffer(body, row, count)
+        columns = [table[str(i)] for i in range(len(names))]
+    elif how == "binary_compressed":
+        columns = _by_columns(_unpacked(body, row.itemsize * count), row, count)
+    else:
+        raise ValueError(f"its data are {how!r}; expected ascii, binary or binary_compressed")
+    values = {
+        name.lower(): column[:, 0].astype(np.float64)
+        for name, column, n in zip(names, columns, counts, strict=True)
+        if n == 1
+    }
+    place = np.array([float(word) for word in header.get("VIEWPOINT", ["0"] * 3)[:3]])
+    return Columns(values, place if place.shape == (3,) and place.any() else None)
+
+
+def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
+    """The entries of the header, and the bytes behind it."""
+    header: dict[str, list[str]] = {}
+    start = 0
+    while "DATA" not in header:
+        end = content.find(b"\n", start)
+        if end < 0 or start > 10_000:
+            raise ValueError("its header does not end in a line DATA")
+        words = content[start:end].decode("ascii").split()
+        start = end + 1
+        if words and words[0] in _ENTRIES and len(words) > 1:
+            header[words[0]] = words[1:]
+    if missing := [name for name in ("FIELDS", "SIZE", "TYPE", "WIDTH") if name not in header]:
+        raise ValueError(f"its header has no line {missing[0]}")
+    return header, content[start:]
+
+
+def _kinds(header: dict[str, list[str]]) -> list[str]:
+    pairs = zip(header["TYPE"], header["SIZE"], strict=True)
+    return [f"<{_KINDS[kind]}{int(size)}" for kind, size in pairs]
+
+
+def _counts(header: dict[str, list[str]]) -> list[int]:
+    counts = [int(word) for word in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
+    if len(counts) != len(header["FIELDS"]) or len(counts) != len(header["SIZE"]):
+        raise ValueError("its header gives another number of sizes than of fields")
+    if min(counts) < 1 or max(counts) > 10_000:
+        raise ValueError(f"its fields hold {counts} numbers")
+    return counts
+
+
+# Data ------------------------------------------------------------------------------------------
+
+
+def _ascii(body: bytes, counts: list[int], count: int) -> list[np.ndarray]:
+    table = np.array(body.split(), dtype=np.float64)
+    width = sum(counts)
+    if len(table) != width * count:
+        raise ValueError(
+            f"it holds {len(table)} numbers; expected {width} of each of {count} points"
+        )
+    return np.split(table.reshape(count, width), np.cumsum(counts)[:-1], axis=1)
+
+
+def _by_columns(content: bytes, row: np.dtype, count: int) -> list[np.ndarray]:
+    """Fields that lie one behind the other, each of all points."""
+    columns, start = [], 0
+    for i in range(len(row.names or ())):
+        field = row[i]
+        columns.append(np.frombuffer(content, field, count, start))
+        start += field.itemsize * count
+    return columns
+
+
+def _unpacked(body: bytes, size: int) -> bytes:
+    """The content of a block: its packed and its real size, then LZF's runs and references."""
+    packed, real = np.frombuffer(body, "<u4", 2)
+    if real != size:
+        raise ValueError(f"its block holds {real} bytes; expected {size}")
+    source, out, i = memoryview(body)[8 : 8 + int(packed)], bytearray(), 0
+    while i < len(source) and len(out) <= size:
+        control = source[i]
+        i += 1
+        if control < 32:  # bytes as they are
+            out += source[i : i + control + 1]
+            i += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length += source[i]
+            i += 1
+        first = len(out) - ((control & 31) << 8) - source[i] - 1
+        i += 1
+        if first < 0:
+            raise ValueError("its block refers to bytes before its start")
+        part = bytes(out[first : first + length + 2])
+        # A reference may reach into what it is about to write, and then repeats.
+        out += (part * (-(-(length + 2) // len(part))))[: length + 2]
+    if len(out) != size:
+        raise ValueError(f"its block unpacks to {len(out)} bytes; expected {size}")
+    return bytes(out)

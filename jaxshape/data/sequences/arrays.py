@@ -1,0 +1,153 @@
+"""One `.npz` file of arrays: depth, and perhaps colour, cameras, poses, masks and times."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxshape.data.sequences.cameras import Calibration
+from jaxshape.data.sequences.frames import FrameFiles, SequenceError
+from jaxshape.data.sequences.listing import Contents, Listed
+from jaxshape.data.sequences.poses import known
+from jaxshape.data.sequences.rasters import Stored
+
+MAX_BYTES = 4 * 2**30
+"""Size up to which the arrays of a file are read, all together."""
+
+_NAMES = {
+    "depth": ("depth", "depths"),
+    "color": ("color", "colors", "rgb", "image", "images"),
+    "K": ("K", "intrinsics"),
+    "poses": ("poses", "T_world_camera", "c2w"),
+    "masks": ("masks", "mask"),
+    "times": ("times", "timestamps"),
+}
+
+
+def fits(contents: Contents) -> bool:
+    return len(contents.files) == len(_files(contents)) == 1 and not contents.folders
+
+
+def _files(contents: Contents) -> list[Path]:
+    return [contents.folder / name for name in contents.files if name.lower().endswith(".npz")]
+
+
+def list_frames(contents: Contents) -> Listed:
+    """`depth [n h w]`, `color [n h w 3]`, `K [3 3]` or `[n 3 3]`, `poses [n 4 4]`, `masks [n h w]`.
+
+    Depth is in metres if it is of floats, in millimetres if of integers. Poses are camera to world;
+    K is as OpenCV has it, with the centre of the first pixel at 0, 0.
+    """
+    path = next(iter(sorted(_files(contents))), None)
+    if path is None:
+        raise SequenceError(f"{contents.folder} holds no .npz file; give the one that you mean.")
+    arrays = _read(path)
+    if "depth" not in arrays:
+        raise SequenceError(f"{path} holds no array called depth; expected depth [n h w]: add it.")
+    depth = arrays["depth"]
+    depth = depth[None] if depth.ndim == 2 else depth
+    count = len(depth)
+    per_frame = {
+        name: _of_frames(arrays.get(name), depth.shape, wanted, path, name)
+        for name, wanted in (("color", (3,)), ("masks", ()))
+    }
+    poses = _checked(arrays.get("poses"), [(count, 4, 4)], path, "poses")
+    times = _checked(arrays.get("times"), [(count,)], path, "times")
+    K = _checked(arrays.get("K"), [(3, 3), (1, 3, 3), (count, 3, 3)], path, "K")
+
+    def stored(name: str, array: np.ndarray | None, index: int) -> Stored | None:
+        return None if array is None else Stored(f"{path}: {name} {index}", array[index])
+
+    return Listed(
+        files=tuple(
+            FrameFiles(
+                f"{index:06d}",
+                Stored(f"{path}: depth {index}", depth[index]),
+                stored("color", per_frame["color"], index),
+                stored("masks", per_frame["masks"], index),
+            )
+            for index in range(count)
+        ),
+        depth_scale=1.0 if depth.dtype.kind == "f" else 1000.0,
+        read_pose=None if poses is None else lambda i: known(poses[i], f"{path}: pose {i}"),
+        times=times if times is not None and (np.diff(times) > 0).all() else None,
+        calibration=None if K is None else _calibration(K, path),
+    )
+
+
+def _calibration(K: np.ndarray, path: Path) -> Calibration:
+    K = K.reshape(-1, 3, 3).copy()
+    K[:, :2, 2] += 0.5
+    return Calibration(K, None, path.name)
+
+
+def _of_frames(
+    array: np.ndarray | None, depth: tuple[int, ...], last: tuple[int, ...], path: Path, name: str
+) -> np.ndarray | None:
+    """Images of the frames, with as many dimensions as they should have."""
+    if array is None:
+        return None
+    array = array[None] if array.ndim == 2 + len(last) else array
+    if array.ndim != 3 + len(last) or len(array) != depth[0] or array.shape[3:] != last:
+        raise SequenceError(
+            f"{path} holds {name} of shape {array.shape} and depth of {depth}; expected an image "
+            "for each depth image."
+        )
+    if name == "color" and array.dtype != np.uint8:
+        raise SequenceError(f"{path} holds color of {array.dtype}; expected uint8, 0 to 255.")
+    return array
+
+
+def _checked(
+    array: np.ndarray | None, shapes: list[tuple[int, ...]], path: Path, name: str
+) -> np.ndarray | None:
+    if array is None:
+        return None
+    if array.shape not in shapes or array.dtype.kind not in "iuf":
+        raise SequenceError(
+            f"{path} holds {name} of shape {array.shape} and type {array.dtype}; expected numbers "
+            f"of shape {' or '.join(map(str, shapes))}."
+        )
+    return array.astype(np.float64)
+
+
+# Reading ---------------------------------------------------------------------------------------
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays that are used, by the first of their names; nothing pickled is loaded."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sizes = {
+                one.filename.removesuffix(".npy"): _size(archive, one) for one in archive.infolist()
+            }
+        chosen = {
+            kind: next(name for name in names if name in sizes)
+            for kind, names in _NAMES.items()
+            if not sizes.keys().isdisjoint(names)
+        }
+        if (total := sum(sizes[name] for name in chosen.values())) > MAX_BYTES:
+            raise ValueError(f"its arrays have {total / 2**30:.1f} GB, more than 4")
+        with np.load(path, allow_pickle=False) as file:
+            return {kind: file[name] for kind, name in chosen.items()}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise SequenceError(
+            f"{path} cannot be read ({error}); expected a file of numpy.savez with depth [n h w] "
+            "and K: write it again."
+        ) from error
+
+
+def _size(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
+    """Bytes that an array says it has; `ValueError` if it is not one, or holds fewer."""
+    if not member.filename.endswith(".npy"):
+        return 0
+    with archive.open(member) as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0
+        if version != (1, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    size = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    if size > member.file_size:
+        raise ValueError(f"{member.filename} promises {size} bytes and holds fewer")
+    return size

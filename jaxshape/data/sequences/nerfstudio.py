@@ -1,0 +1,185 @@
+"""nerfstudio, and Polycam through it: `transforms.json` with a camera and a pose for each image."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxshape.data.sequences.cameras import Calibration, matrices_of
+from jaxshape.data.sequences.documents import below, matrix_of, read_json_object
+from jaxshape.data.sequences.frames import (
+    Finding,
+    FrameFiles,
+    SequenceError,
+    read_shape,
+    usual_depth_scale,
+)
+from jaxshape.data.sequences.listing import (
+    Contents,
+    Listed,
+    depth_images,
+    has_depth_folder,
+    numbers_in,
+    partners,
+)
+from jaxshape.data.sequences.poses import from_opengl, known
+
+_SOURCE = "transforms.json"
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def fits(contents: Contents) -> bool:
+    return _SOURCE in contents.files
+
+
+def list_frames(contents: Contents) -> Listed:
+    """`transforms.json`, and the images it names: `file_path`, `depth_file_path`, `mask_path`.
+
+    Poses are camera to world with OpenGL's axes, y up and z backwards; cameras count pixels from
+    the corner of the image, as ours do. Frames are ordered by the names of their images.
+    """
+    source = contents.folder / _SOURCE
+    about = read_json_object(source)
+    frames = sorted(_frames(about, source), key=_order)
+    depth = _depth_of(contents, frames, source)
+    kept = [i for i, path in enumerate(depth) if path is not None]
+    if not kept:
+        raise SequenceError(
+            f"{source} names no depth image; expected depth_file_path in its frames: process the "
+            "recording again with its depth (ns-process-data polycam --use-depth)."
+        )
+    files = [_files(contents.folder, frames[i], depth[i], source) for i in kept]
+    frames = [frames[i] for i in kept]
+    scale = float(matrix_of(about.get("applied_scale", 1.0), (), source, "applied_scale"))
+
+    def read(index: int) -> Float[np.ndarray, "4 4"] | None:
+        T = np.eye(4)
+        rows = matrix_of(frames[index].get("transform_matrix"), (-1, 4), source, "transform_matrix")
+        T[: len(rows)] = rows[:4]
+        T[:3, 3] /= scale
+        return known(from_opengl(T), f"The pose of {files[index].name} in {source}")
+
+    return Listed(
+        files=tuple(files),
+        depth_scale=_depth_scale(about, files, source),
+        read_pose=read,
+        calibration=_calibration(about, frames, files, source),
+        findings=(*_left_out(len(depth) - len(kept)), *_distorted(about, frames)),
+    )
+
+
+def _frames(about: dict[str, Any], source: Path) -> list[dict[str, Any]]:
+    frames = about.get("frames")
+    if not isinstance(frames, list) or not all(isinstance(one, dict) for one in frames):
+        raise SequenceError(f"{source} holds no list of frames; write it again.")
+    return frames
+
+
+def _order(frame: dict[str, Any]) -> tuple[tuple[int, ...], str]:
+    name = str(frame.get("file_path"))
+    return numbers_in(name), name
+
+
+# Images ----------------------------------------------------------------------------------------
+
+
+def _depth_of(contents: Contents, frames: list[dict[str, Any]], source: Path) -> list[Path | None]:
+    """The depth image of each frame: the named one, or that of the same name or number."""
+    if any(frame.get("depth_file_path") for frame in frames):
+        named = [frame.get("depth_file_path") for frame in frames]
+        return [below(contents.folder, name, source) if name else None for name in named]
+    if not has_depth_folder(contents):
+        return [None] * len(frames)
+    return partners(
+        [Path(str(one.get("file_path"))).stem for one in frames], depth_images(contents)
+    )
+
+
+def _files(folder: Path, frame: dict[str, Any], depth: Path | None, source: Path) -> FrameFiles:
+    assert depth is not None
+    name, mask = frame.get("file_path"), frame.get("mask_path")
+    color = below(folder, name, source) if name else None
+    if color is not None and not color.suffix:  # as Blender's synthetic scenes name them
+        color = color.with_suffix(".png")
+    if color is not None and not color.is_file():
+        color = None
+    return FrameFiles(depth.stem, depth, color, below(folder, mask, source) if mask else None)
+
+
+def _depth_scale(about: dict[str, Any], files: list[FrameFiles], source: Path) -> float:
+    if (unit := about.get("depth_unit_scale_factor")) is None:
+        return usual_depth_scale(one.depth for one in files)
+    metres = float(matrix_of(unit, (), source, "depth_unit_scale_factor"))
+    if not (np.isfinite(metres) and metres > 0):
+        raise SequenceError(
+            f"{source} gives depth_unit_scale_factor {metres:g}; expected the metres in a unit of "
+            "depth, which are positive: 0.001 for millimetres."
+        )
+    return 1 / metres
+
+
+# Cameras ---------------------------------------------------------------------------------------
+
+
+def _calibration(
+    about: dict[str, Any], frames: list[dict[str, Any]], files: list[FrameFiles], source: Path
+) -> Calibration:
+    """The camera of each frame, whose entries go before those of the whole file."""
+    entries = [about | frame for frame in frames]
+    shape = _shape(entries, files, source)
+    numbers = np.array([_numbers(entry, shape, source) for entry in entries])
+    if (numbers == numbers[0]).all():
+        return Calibration(matrices_of(*numbers[0]), shape, source.name)
+    return Calibration(matrices_of(*numbers.T), shape, f"{source.name}, of each frame its own")
+
+
+def _shape(entries: list[dict[str, Any]], files: list[FrameFiles], source: Path) -> tuple[int, int]:
+    shapes = {(one.get("h"), one.get("w")) for one in entries}
+    if len(shapes) > 1:
+        raise SequenceError(
+            f"{source} has images of {len(shapes)} sizes; expected one size: scale the images and "
+            "their cameras."
+        )
+    h, w = shapes.pop()
+    if h is None or w is None:
+        first = files[0].color or files[0].depth
+        return read_shape(first)
+    height, width = matrix_of([h, w], (2,), source, "w and h")
+    return int(height), int(width)
+
+
+def _numbers(entry: dict[str, Any], shape: tuple[int, int], source: Path) -> list[float]:
+    """fx, fy, cx, cy; without focal lengths from the angles of view, as Blender gives them."""
+    h, w = shape
+    fx, fy = entry.get("fl_x"), entry.get("fl_y")
+    if fx is None and entry.get("camera_angle_x") is not None:
+        angle = float(matrix_of(entry["camera_angle_x"], (), source, "camera_angle_x"))
+        fx = w / (2 * np.tan(angle / 2))
+    fy = fx if fy is None else fy
+    center = entry.get("cx", w / 2), entry.get("cy", h / 2)
+    return matrix_of([fx, fy, *center], (4,), source, "fl_x, fl_y, cx, cy").tolist()
+
+
+# Findings --------------------------------------------------------------------------------------
+
+
+def _left_out(count: int) -> tuple[Finding, ...]:
+    if not count:
+        return ()
+    return (Finding(f"{count} frames have no depth image", "They are left out."),)
+
+
+def _distorted(about: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Finding, ...]:
+    entry = about | frames[0]
+    lens = {name: entry[name] for name in _LENS if isinstance(entry.get(name), int | float)}
+    if max(map(abs, lens.values()), default=0.0) < 0.01 and "FISHEYE" not in str(
+        entry.get("camera_model")
+    ):
+        return ()
+    return (
+        Finding(
+            f"the images are bent by their lens ({lens}), and are taken as straight",
+            "Undistort colour and depth images first, if surfaces come out bent.",
+        ),
+    )

@@ -1,0 +1,41 @@
+"""ScanNet (Dai et al., CVPR 2017), as its SensReader exports scenes."""
+
+from jaxshape.data.sequences.cameras import Calibration
+from jaxshape.data.sequences.frames import FrameFiles
+from jaxshape.data.sequences.listing import (
+    Contents,
+    Listed,
+    color_images,
+    depth_images,
+    files_in,
+    has_depth_folder,
+    mask_images,
+    partners,
+)
+from jaxshape.data.sequences.poses import read_matrix, read_pose
+
+_CAMERA = "intrinsic/intrinsic_depth.txt"
+
+
+def fits(contents: Contents) -> bool:
+    return has_depth_folder(contents) and (contents.folder / _CAMERA).is_file()
+
+
+def list_frames(contents: Contents) -> Listed:
+    """`depth/N.png` in millimetres, `color/N.jpg`, `pose/N.txt`, `intrinsic/intrinsic_depth.txt`.
+
+    Poses are camera to world, of -inf where tracking was lost. The colour camera is larger and a
+    few millimetres beside the depth camera, to which the colours are taken as registered.
+    """
+    depth = depth_images(contents)
+    poses = partners(depth, files_in(contents, ("pose", "poses"), (".txt",)))
+    color = partners(depth, color_images(contents))
+    masks = partners(depth, mask_images(contents))
+    K = read_matrix(contents.folder / _CAMERA, 4)[:3, :3]
+    K[:2, 2] += 0.5  # theirs count from the centre of the first pixel
+    return Listed(
+        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        depth_scale=1000.0,
+        read_pose=(lambda index: read_pose(poses[index])) if any(poses) else None,
+        calibration=Calibration(K[None], None, _CAMERA),
+    )

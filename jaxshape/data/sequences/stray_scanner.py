@@ -1,0 +1,121 @@
+"""Stray Scanner: recordings with the LiDAR of an iPhone or iPad."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxshape.data.sequences.cameras import Calibration, matrices_of
+from jaxshape.data.sequences.documents import read_bounded, rows_of
+from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError, read_shape
+from jaxshape.data.sequences.listing import (
+    Contents,
+    Listed,
+    color_images,
+    depth_images,
+    files_in,
+    has_depth_folder,
+    mask_images,
+    numbers_in,
+    partners,
+)
+from jaxshape.data.sequences.poses import from_quaternions, known
+
+_FILM = (1440, 1920)
+"""Height and width of the film, of which the camera is."""
+
+_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_OWN_CAMERA = ("fx", "fy", "cx", "cy")
+
+
+def fits(contents: Contents) -> bool:
+    return "odometry.csv" in contents.files and has_depth_folder(contents)
+
+
+def list_frames(contents: Contents) -> Listed:
+    """`depth/N.png` in millimetres, `confidence/N.png`, `odometry.csv`, `camera_matrix.csv`.
+
+    Poses are camera to world, of OpenCV's axes. Newer versions give each frame its own camera. The
+    colours are in a film, `rgb.mp4`; they are used where they were unpacked to `rgb/N.png`.
+    """
+    depth = depth_images(contents)
+    source = contents.folder / "odometry.csv"
+    columns = _read_columns(source)
+    row_of = {int(number): row for row, number in enumerate(columns["frame"])}
+    rows = [row_of.get((-1, *numbers_in(name))[-1], -1) for name in depth]
+    places = np.stack([columns[name] for name in "xyz"], axis=-1)
+    turns = np.stack([columns[name] for name in ("qx", "qy", "qz", "qw")], axis=-1)
+    T = from_quaternions(places, turns, source)
+    color, masks = partners(depth, color_images(contents)), partners(depth, mask_images(contents))
+    confidence = partners(depth, files_in(contents, ("confidence",), (".png",)))
+
+    def read(index: int) -> Float[np.ndarray, "4 4"] | None:
+        row = rows[index]
+        return None if row < 0 else known(T[row], f"Pose {row} of {source}")
+
+    times = columns["timestamp"][rows]
+    rising = min(rows) >= 0 and bool((np.diff(times) > 0).all())
+    return Listed(
+        files=tuple(map(FrameFiles, depth, depth.values(), color, masks, confidence)),
+        depth_scale=1000.0,
+        read_pose=read,
+        times=times if rising else None,
+        calibration=_calibration(contents, columns, rows, color),
+        findings=_without_film(contents) if not any(color) else (),
+    )
+
+
+def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
+    """The columns of the table by their names; NaN where a cell is empty."""
+    lines = list(csv.reader(read_bounded(path).splitlines()))
+    names = [name.strip() for name in lines[0]] if lines else []
+    if missing := [name for name in _COLUMNS if name not in names]:
+        raise SequenceError(
+            f"{path} has no column {missing[0]}; expected a first line of {', '.join(_COLUMNS)}: "
+            "export the recording again."
+        )
+    try:
+        rows = [
+            [float(cell) if cell.strip() else np.nan for cell in row] for row in lines[1:] if row
+        ]
+        table = np.array([row + [np.nan] * (len(names) - len(row)) for row in rows])
+        table = table.reshape(-1, len(names))
+        if not np.isfinite(table[:, names.index("frame")]).all():
+            raise ValueError("a row has no frame")
+    except ValueError as error:
+        raise SequenceError(
+            f"{path} is not a table of numbers ({error}); export the recording again."
+        ) from error
+    return dict(zip(names, table.T, strict=True))
+
+
+def _calibration(
+    contents: Contents, columns: dict[str, np.ndarray], rows: list[int], color: list[Path | None]
+) -> Calibration | None:
+    """The camera of each frame, or else that of all, both of the film's size."""
+    images = [path for path in color if path]
+    shape = read_shape(images[0]) if images else _FILM
+    own = [columns[name][rows] for name in _OWN_CAMERA if name in columns]
+    if len(own) == 4 and min(rows) >= 0 and np.isfinite(own).all():
+        return Calibration(matrices_of(*own), shape, "odometry.csv, of each frame its own")
+    if "camera_matrix.csv" not in contents.files:
+        return None
+    K = np.array(rows_of(contents.folder / "camera_matrix.csv", (3,)))
+    if K.shape != (3, 3):
+        raise SequenceError(
+            f"{contents.folder / 'camera_matrix.csv'} holds {len(K)} lines; expected 3 of 3 "
+            "numbers: export the recording again."
+        )
+    return Calibration(K[None], shape, "camera_matrix.csv")
+
+
+def _without_film(contents: Contents) -> tuple[Finding, ...]:
+    if "rgb.mp4" not in contents.files:
+        return ()
+    return (
+        Finding(
+            "the colours are in a film, rgb.mp4, which is not read",
+            "To use them: mkdir rgb; ffmpeg -i rgb.mp4 -start_number 0 rgb/%06d.png",
+        ),
+    )

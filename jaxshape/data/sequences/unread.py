@@ -1,0 +1,53 @@
+"""Files of a recording that look like poses or a camera and are not read."""
+
+import re
+from collections.abc import Iterator
+
+from jaxshape.data.sequences.frames import Finding
+from jaxshape.data.sequences.listing import Contents
+
+_POSES = re.compile(
+    r"pose|traj|odom|groundtruth|ground_truth|transforms.*json|scene_gt|extrinsic|cameras?\.txt"
+    r"|images\.(txt|bin)|slam",
+    re.IGNORECASE,
+)
+_CAMERA = re.compile(
+    r"intrinsic|calib|scene_camera|camera|cam_k|metadata|info\.txt|transforms.*json", re.IGNORECASE
+)
+_TEXT = (".txt", ".json", ".csv", ".log", ".yaml", ".yml", ".tum", ".bin", ".freiburg", ".xml")
+_OURS = ("keyframes.json", "result.json")
+
+
+def unread(
+    contents: Contents, *, has_poses: bool, has_camera: bool, told: tuple[Finding, ...] = ()
+) -> Iterator[Finding]:
+    """Remarks on files that lie in a recording for which no use was found.
+
+    Args:
+        contents: The folder.
+        has_poses: Whether the recording was found to have poses; if so, no others are missed.
+        has_camera: Whether a camera was found.
+        told: Remarks that were made already; files that they name are left out.
+    """
+    told_of = " ".join(evidence for evidence, _ in told)
+    untold = frozenset(name for name in contents.files if name not in told_of)
+    contents = contents._replace(files=untold)
+    if not has_poses and (found := _like(_POSES, contents)):
+        yield Finding(
+            f"no poses are read, though {found} may hold them",
+            "Poses are read from groundtruth.txt beside depth.txt, poses/N.txt, trajectory.log or "
+            "an Open3D trajectory.json: write theirs so, or the camera is tracked.",
+        )
+    if not has_camera and (found := _like(_CAMERA, contents)):
+        yield Finding(
+            f"no camera is read, though {found} may hold it",
+            "Write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt in the folder.",
+        )
+
+
+def _like(pattern: re.Pattern[str], contents: Contents) -> str:
+    """Names that match, in words; at most four."""
+    files = (name for name in contents.files if name.lower().endswith(_TEXT) and name not in _OURS)
+    folders = (f"{name}/" for name in contents.folders)
+    found = sorted(filter(pattern.search, (*files, *folders)))
+    return ", ".join(found[:4]) + (", ..." if len(found) > 4 else "")

@@ -1,0 +1,109 @@
+"""The object's pixels in the keyframes of a map, decided together. [host]
+
+cut_new       the pixels of a new frame
+cut_all       those of all keyframes, after its box has changed
+is_outgrown   whether more belongs to the object than its box holds
+"""
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxshape.data.boxes import Box
+from jaxshape.mapping.placement.faces import (
+    Cutout,
+    cutouts,
+    in_object,
+    object_points,
+    reach_of,
+    world_points,
+)  # fmt: skip
+from jaxshape.mapping.segmentation.belonging import Seen, belonging
+from jaxshape.mapping.segmentation.parts import Parts, parts_of
+from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame
+
+RECENT = 8
+"""Keyframes, besides the first, that a new one is compared with."""
+
+OUTSIDE = 0.01
+"""Share of the object's points outside of its box from which that is too small."""
+
+FURTHER = 0.03
+"""Metres outside of the box from which points count: noise goes that far."""
+
+
+def parts_in(prepared: PreparedFrame, *, first: bool = False) -> Parts:
+    """The parts of a frame at working size.
+
+    Args:
+        prepared: The frame.
+        first: Whether it is the first frame, whose mask shows the object.
+    """
+    fx, fy, cx, cy = (float(x) for x in prepared.view.intrinsics)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    sure = np.asarray(prepared.masked) if first else None
+    return parts_of(np.asarray(prepared.view.depth), K, sure)
+
+
+def cut_new(
+    prepared: PreparedFrame, keyframes: tuple[Keyframe, ...], box: Box, T_world_camera: jaxlie.SE3
+) -> tuple[Parts, Bool[Array, "h w"]]:
+    """The parts of a new frame, and its pixels that show the object.
+
+    Args:
+        prepared: The frame.
+        keyframes: The keyframes before it.
+        box: The box that the object is cut out with.
+        T_world_camera: Pose of the frame.
+
+    Returns:
+        The parts, and True on pixels that show the object `[h w]`.
+    """
+    parts = parts_in(prepared)
+    T = np.asarray(T_world_camera.as_matrix(), np.float64)
+    nothing = jnp.zeros_like(prepared.masked)
+    new = _seen(Cutout(prepared.view.depth, nothing, prepared.view.intrinsics, T), parts)
+    compared = _all_seen(keyframes[:1] + keyframes[1:][-RECENT:])
+    return parts, jnp.asarray(belonging([*compared, new], box, *reach_of(box))[-1])
+
+
+def cut_all(keyframes: tuple[Keyframe, ...], box: Box) -> tuple[Keyframe, ...]:
+    """The keyframes with the pixels that show the object, given its box.
+
+    Args:
+        keyframes: The keyframes of a map.
+        box: The box that the object is cut out with.
+
+    Returns:
+        The keyframes; those whose object was given by a mask are as they were.
+    """
+    found = belonging(_all_seen(keyframes), box, *reach_of(box))
+    return tuple(
+        one if one.parts is None else one._replace(segmented=jnp.asarray(pixels))
+        for one, pixels in zip(keyframes, found, strict=True)
+    )
+
+
+def is_outgrown(box: Box, keyframes: tuple[Keyframe, ...]) -> bool:
+    """Whether more was measured of the object, outside of its box, than noise.
+
+    Args:
+        box: The object's box.
+        keyframes: The keyframes of a map.
+    """
+    points = in_object(object_points(cutouts(keyframes)), box)
+    outside = (np.abs(points) > box.size / 2 + FURTHER).any(axis=1)
+    return len(points) > 0 and bool(outside.mean() > OUTSIDE)
+
+
+def _all_seen(keyframes: tuple[Keyframe, ...]) -> list[Seen]:
+    return [_seen(view, one.parts) for view, one in zip(cutouts(keyframes), keyframes, strict=True)]
+
+
+def _seen(view: Cutout, parts: Parts | None) -> Seen:
+    """A frame in the world; where the box alone tells the object, all of it is known."""
+    segmented = np.asarray(view.segmented)
+    if parts is None:
+        return Seen(world_points(view), np.zeros(segmented.shape, int), segmented)
+    return Seen(world_points(view), np.asarray(parts.labels), np.asarray(parts.sure))

@@ -1,0 +1,73 @@
+"""What the keyframes of a map did not see, in sentences. [host]"""
+
+import numpy as np
+
+from jaxshape.mapping.map.recording import Progress
+from jaxshape.mapping.placement.faces import FACES, cutouts, faces_of, in_object, object_points
+
+LEGS = 0.15
+"""Share of the height of the box, from below, that legs take up at least."""
+
+_LOWEST = 0.5  # percent of the points that may lie below what counts as measured
+
+
+def doubts_of(progress: Progress) -> tuple[str, ...]:
+    """Warnings of what was not seen of the object: in keyframes, of its box and of its legs.
+
+    Args:
+        progress: Progress of a recording.
+
+    Returns:
+        A sentence for each; none about a box that was given.
+    """
+    if progress.start.T_level_world is None:
+        return _empty(progress)
+    return (*_empty(progress), *_unseen(progress), *_legs(progress))
+
+
+def _empty(progress: Progress) -> tuple[str, ...]:
+    names = [
+        log.name
+        for log, keyframe in progress.of_keyframes()
+        if not np.asarray(keyframe.segmented).any()
+    ]
+    if not names:
+        return ()
+    which = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return (f"No pixel was taken for the object in {which}; nothing of that is fused.",)
+
+
+def _unseen(progress: Progress) -> tuple[str, ...]:
+    """The faces of the box whose place is a guess."""
+    box, views = progress.start.box, cutouts(progress.state.keyframes)
+    faces = faces_of(box, views)
+    if faces is None:
+        return ()
+    is_known = faces.seen.copy()
+    is_known[0, 1] |= np.isfinite(progress.start.floor)
+    names = [FACES[axis][side] for axis in range(3) for side in (0, 1) if not is_known[side, axis]]
+    if not names:
+        return ()
+    return (
+        f"Where the object ends was not seen at its {_joined(names)}: what the prior expects there "
+        "decides its size. Film it from there too.",
+    )
+
+
+def _joined(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _legs(progress: Progress) -> tuple[str, ...]:
+    """Whether everything near the floor is predicted."""
+    box = progress.start.box
+    points = in_object(object_points(cutouts(progress.state.keyframes)), box)
+    if not len(points):
+        return ()
+    lowest = float(np.percentile(points[:, 1], _LOWEST)) + box.size[1] / 2
+    if lowest < LEGS * box.size[1]:
+        return ()
+    return (
+        f"Nothing was measured of its lowest {100 * lowest:.0f} cm: legs, or what else is there, "
+        "are predicted.",
+    )

@@ -1,0 +1,159 @@
+"""Which parts of many frames are the object, decided together. [host]
+
+A part of one frame belongs to the object if it lies in the object's box, or if it shows again what
+is known to be the object and ends within the prior's reach: so that a box which was cut too short
+does not exclude what it should have held. Parts that other frames show apart from the object, or
+that go on beyond its reach, are something else.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from jaxshape.data.boxes import Box, points_in_box
+
+NEAR = 0.03
+"""Metres within which two frames have measured the same thing."""
+
+MOSTLY, WHOLLY = 0.5, 0.95
+"""Share of a part that lies in the box of the object, and within its reach, to be part of it."""
+
+AGAIN = 0.1
+"""Share of a part that was measured before, as the object, to be the object seen again."""
+
+FOREIGN = 0.2
+"""Share of a part above which measurements of other things cut it."""
+
+ROUNDS = 4
+"""Times at which parts are judged again with what the last ones added."""
+
+_SAMPLE = 500  # points of each part that are asked
+_SPACING = 0.01  # metres between the points of the object that are kept
+
+
+class Seen(NamedTuple):
+    """One frame, in the world.
+
+    Attributes:
+        points: Points of the pixels, in metres; NaN where nothing was measured `[h w 3]`.
+        labels: Part of each pixel, from 1; 0 for floor, walls and table tops `[h w]`.
+        sure: True on pixels that are known to show the object `[h w]`.
+    """
+
+    points: Float[np.ndarray, "h w 3"]
+    labels: Int[np.ndarray, "h w"]
+    sure: Bool[np.ndarray, "h w"]
+
+
+class _Part(NamedTuple):
+    """One part: the frame it is in, its label, some of its points, and how they lie."""
+
+    frame: int
+    label: int
+    points: Float[np.ndarray, "n 3"]
+    in_box: float
+    in_reach: float
+    in_column: float
+
+
+class _Known(NamedTuple):
+    """What was measured, in trees that find the nearest point: the object, and other things."""
+
+    ours: KDTree
+    others: KDTree
+
+
+def belonging(
+    frames: list[Seen], box: Box, reach: Box, column: Box
+) -> list[Bool[np.ndarray, "h w"]]:
+    """The pixels of each frame that show the object.
+
+    Args:
+        frames: The frames, in the world.
+        box: The object's box, as far as it is known.
+        reach: The largest box that the object may turn out to fill.
+        column: The part of the reach above and below the box: what lies there and is not known to
+            be the object is not known to be something else.
+
+    Returns:
+        For each frame, True on the object `[h w]`.
+    """
+    parts = [part for i, seen in enumerate(frames) for part in _parts(i, seen, box, reach, column)]
+    sure = [seen.points[seen.sure & points_in_box(seen.points, reach)] for seen in frames]
+    background = [_background(seen, column) for seen in frames]
+    known, whole = _Known(_tree(sure), _tree(background)), set()
+    for _ in range(ROUNDS):
+        ours = [part for part in parts if _is_ours(part, known.ours)]
+        taken = {part[:2] for part in ours}
+        apart = [part for part in parts if part[:2] not in taken and part.in_column < MOSTLY]
+        known = known._replace(others=_tree([*background, *(part.points for part in apart)]))
+        before, whole = whole, {part[:2] for part in ours if _is_whole(part, known)}
+        if whole == before:
+            break
+        more = [part.points for part in ours if part[:2] in whole]
+        known = known._replace(ours=_tree([*sure, *more]))
+    return [
+        _pixels(seen, [p for p in ours if p.frame == i], whole, known, box, reach)
+        for i, seen in enumerate(frames)
+    ]
+
+
+def _is_ours(part: _Part, ours: KDTree) -> bool:
+    """Whether a part is the object, all of it or some."""
+    return part.in_box > MOSTLY or float(_near(part.points, ours).mean()) > AGAIN
+
+
+def _is_whole(part: _Part, known: _Known) -> bool:
+    """Whether nothing of a part of the object is anything else."""
+    return part.in_reach > WHOLLY and float(_foreign(part.points, known).mean()) < FOREIGN
+
+
+def _foreign(points: Float[np.ndarray, "n 3"], known: _Known) -> Bool[np.ndarray, " n"]:
+    """Points where other things were measured, and not the object."""
+    return _near(points, known.others) & ~_near(points, known.ours)
+
+
+def _near(points: Float[np.ndarray, "n 3"], tree: KDTree) -> Bool[np.ndarray, " n"]:
+    return np.isfinite(tree.query(points, distance_upper_bound=NEAR)[0])
+
+
+def _pixels(
+    seen: Seen, ours: list[_Part], whole: set[tuple[int, int]], known: _Known, box: Box, reach: Box
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the parts that are the object; of those that are more than it, those in its box."""
+    in_whole = np.isin(seen.labels, [part.label for part in ours if part[:2] in whole])
+    found = (seen.sure | in_whole) & points_in_box(seen.points, reach)
+    mixed = np.isin(seen.labels, [part.label for part in ours if part[:2] not in whole])
+    mixed &= points_in_box(seen.points, box) & ~found
+    found[mixed] = ~_foreign(seen.points[mixed], known)
+    return found
+
+
+# Points ------------------------------------------------------------------------------------------
+
+
+def _parts(index: int, seen: Seen, box: Box, reach: Box, column: Box) -> list[_Part]:
+    """The parts of a frame that lie, at least a little, within the reach of the object."""
+    within = [points_in_box(seen.points, one) for one in (box, reach, column)]
+    found = []
+    for label in np.unique(seen.labels[within[1] & (seen.labels > 0)]):
+        pixels = seen.labels == label
+        points = seen.points[pixels]
+        shares = [float(inside[pixels].mean()) for inside in within]
+        found.append(_Part(index, int(label), points[:: 1 + len(points) // _SAMPLE], *shares))
+    return found
+
+
+def _background(seen: Seen, column: Box) -> Float[np.ndarray, "n 3"]:
+    """Some points of walls and table tops around the object; the floor is excluded from its box."""
+    points = seen.points[(seen.labels == 0) & ~seen.sure]
+    return points[points_in_box(points, column)][::3]
+
+
+def _tree(clouds: list[Float[np.ndarray, "_ 3"]]) -> KDTree:
+    """Points of some clouds, one in each small cell."""
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    cells = np.floor(points / _SPACING).astype(np.int64)
+    return KDTree(points[np.sort(np.unique(cells, axis=0, return_index=True)[1])])

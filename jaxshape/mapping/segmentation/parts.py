@@ -1,0 +1,58 @@
+"""Parts that a depth frame falls into, and the floor in it: all that later decisions need. [host]
+
+Finding them costs most of the time of a segmentation, and depends on the frame alone. Which parts
+are the object is decided again and again, as other frames are seen (`belonging`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxshape.mapping.segmentation.clusters import background, clusters, look
+
+NO_FLOOR = np.full(4, np.nan)
+"""The floor of a frame that shows none."""
+
+
+class Parts(NamedTuple):
+    """Parts of a depth frame.
+
+    Attributes:
+        labels: Cluster of each pixel, from 1; 0 on floor, walls and table tops, and where nothing
+            was measured `[h w]`.
+        sure: True on pixels that are known to show the object `[h w]`.
+        floor: Normal of the floor, towards the camera, and the height of the camera above it in
+            metres, in the frame of the camera `[4]`; NaN where no floor is seen.
+        evidence: Evidence from this frame, from 0 to 1, that this is the floor.
+    """
+
+    labels: Int[np.ndarray, "h w"]
+    sure: Bool[np.ndarray, "h w"]
+    floor: Float[np.ndarray, " 4"]
+    evidence: float
+
+
+def parts_of(
+    depth: Float[np.ndarray, "h w"],
+    K: Float[np.ndarray, "3 3"],
+    sure: Bool[np.ndarray, "h w"] | None = None,
+) -> Parts:
+    """The parts of a frame.
+
+    Args:
+        depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
+        K: Camera matrix `[3 3]`, in pixels.
+        sure: Pixels that are known to show the object `[h w]`; None for none.
+
+    Returns:
+        The clusters, and the floor with its evidence.
+    """
+    view = look(depth, K, stride=1)
+    labels = clusters(view, np.isfinite(view.z) & ~background(view, None))
+    known = np.zeros(depth.shape, bool) if sure is None else sure
+    if view.floor is None:
+        return Parts(labels, known, NO_FLOOR, 0.0)
+    plane = view.floor.plane
+    floor = np.array([*plane.normal, plane.offset], np.float64)
+    return Parts(labels, known, floor, view.floor.confidence)

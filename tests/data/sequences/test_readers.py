@@ -1,0 +1,327 @@
+"""What phones, datasets and renderers write is read as it was seen, with their own conventions."""
+
+import json
+
+import numpy as np
+import pytest
+from device_recordings import (
+    OWN_CAMERAS,
+    TO_OPENGL,
+    WRITERS,
+    save_float_tiff,
+    shoot,
+    write_bop,
+    write_nerfstudio,
+    write_npz,
+    write_record3d,
+    write_replica,
+    write_scannet,
+    write_stray_scanner,
+    write_wild_rgbd,
+)
+from recordings import OPENCV, H, W, raw, save
+
+from jaxshape.data.sequences import LAYOUTS, SequenceError, open_sequence
+
+SEEN = shoot()
+
+
+def fault_of(folder):
+    with pytest.raises(SequenceError) as caught:
+        list(open_sequence(folder))
+    sentence = str(caught.value)
+    assert "\n" not in sentence and sentence.endswith(".")
+    return sentence
+
+
+def share_seen_again(a, b):
+    """Pixels of one frame that a second one sees at the same place, moved by their poses."""
+    v, u = np.mgrid[:H, :W] + 0.5
+    pixels = np.stack([u, v, np.ones((H, W))], -1).reshape(-1, 3)
+    p_a = pixels @ np.linalg.inv(a.intrinsics).T * a.depth.reshape(-1, 1)
+    T_b_a = np.linalg.inv(b.T_world_camera) @ a.T_world_camera
+    p_b = p_a[a.depth.ravel() > 0] @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    u, v, z = (p_b @ b.intrinsics.T).T
+    column, row = np.floor(u / z).astype(int), np.floor(v / z).astype(int)
+    inside = (z > 0) & (column >= 0) & (column < W) & (row >= 0) & (row < H)
+    there = b.depth[row[inside], column[inside]]
+    known = there > 0
+    return np.mean(np.abs(there - z[inside])[known] < 0.02)
+
+
+# All of them -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_frames_are_read_as_they_were_seen(tmp_path, name):
+    WRITERS[name](tmp_path, SEEN)
+    sequence = open_sequence(tmp_path)
+    assert sequence.layout == name and len(sequence) == len(SEEN.depth) and sequence.has_poses
+    unit = 1 / 6553.5 if name == "replica" else 1e-6
+    for i, frame in enumerate(sequence):
+        measured = SEEN.mask[i] if name == "stray-scanner" else np.ones((H, W), bool)
+        np.testing.assert_allclose(frame.depth[measured], SEEN.depth[i][measured], atol=unit)
+        assert (frame.depth[~measured] == 0).all()
+        np.testing.assert_allclose(frame.T_world_camera, SEEN.T_world_camera[i], atol=1e-6)
+        np.testing.assert_allclose(frame.intrinsics, SEEN.K[i], atol=1e-6)
+        if name == "stray-scanner":  # its images are scaled down from those of the film
+            assert np.corrcoef(frame.color.ravel(), SEEN.color[i].ravel())[0, 1] > 0.8
+        else:
+            np.testing.assert_array_equal(frame.color, SEEN.color[i])
+        if frame.mask is not None:
+            np.testing.assert_array_equal(frame.mask, SEEN.mask[i])
+
+
+@pytest.mark.parametrize("name", OWN_CAMERAS)
+def test_each_frame_has_the_camera_it_was_taken_with(tmp_path, name):
+    seen = shoot(zoom=0.08)
+    WRITERS[name](tmp_path, seen)
+    frames = list(open_sequence(tmp_path))
+    for frame, K in zip(frames, seen.K, strict=True):
+        np.testing.assert_allclose(frame.intrinsics, K, atol=1e-6)
+    assert share_seen_again(frames[0], frames[4]) > 0.9
+    alike = frames[4]._replace(intrinsics=frames[0].intrinsics)
+    assert share_seen_again(frames[0], alike) < 0.5
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_poses_bring_one_frame_onto_another(tmp_path, name):
+    WRITERS[name](tmp_path, SEEN)
+    a, b = (open_sequence(tmp_path)[i] for i in (0, 4))
+    assert share_seen_again(a, b) > 0.85  # the rest is hidden by the sphere
+    for wrong in (np.linalg.inv, lambda T: T @ TO_OPENGL):
+        turned = [one._replace(T_world_camera=wrong(one.T_world_camera)) for one in (a, b)]
+        assert share_seen_again(*turned) < 0.7
+
+
+@pytest.mark.parametrize(
+    "name, file",
+    [
+        ("bop", "scene_camera.json"),
+        ("wildrgb-d", "cam_poses.txt"),
+        ("wildrgb-d", "metadata"),
+        ("stray-scanner", "odometry.csv"),
+        ("stray-scanner", "camera_matrix.csv"),
+        ("nerfstudio", "transforms.json"),
+        ("replica", "cam_params.json"),
+        ("scannet", "intrinsic/intrinsic_depth.txt"),
+        ("npz", "scan.npz"),
+    ],
+)
+@pytest.mark.parametrize("content", [b"", b"[1, 2]", b'{"frames": 3}', b"\xff\x00\xfe", b"1 x 3\n"])
+def test_damaged_files_end_in_one_sentence(tmp_path, name, file, content):
+    if name == "stray-scanner":
+        write_stray_scanner(tmp_path, SEEN, own_cameras=False, unpacked=False)
+    else:
+        WRITERS[name](tmp_path, SEEN)
+    (tmp_path / file).write_bytes(content)
+    assert fault_of(tmp_path)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_an_empty_folder_is_of_no_layout_that_is_asked_for(tmp_path, name):
+    with pytest.raises(SequenceError, match=r"\.$"):
+        open_sequence(tmp_path, layout=name)
+
+
+# ScanNet, WildRGB-D, Replica -------------------------------------------------------------------
+
+
+def test_a_pose_of_infinity_is_none(tmp_path):
+    write_scannet(tmp_path, SEEN)
+    np.savetxt(tmp_path / "pose/2.txt", np.full((4, 4), -np.inf))
+    poses = [frame.T_world_camera is None for frame in open_sequence(tmp_path)]
+    assert poses == [False, False, True, False, False]
+
+
+def test_wild_rgbd_poses_are_found_by_the_number_of_the_image(tmp_path):
+    write_wild_rgbd(tmp_path, SEEN)
+    lines = (tmp_path / "cam_poses.txt").read_text().splitlines()
+    (tmp_path / "cam_poses.txt").write_text("\n".join(lines[:1:-1]))  # the last three, backwards
+    sequence = open_sequence(tmp_path)
+    assert sequence[1].T_world_camera is None
+    np.testing.assert_allclose(sequence[3].T_world_camera, SEEN.T_world_camera[3], atol=1e-9)
+
+
+def test_a_trajectory_of_tum_called_traj_is_not_replica(tmp_path):
+    write_replica(tmp_path, SEEN)
+    (tmp_path / "results").rename(tmp_path / "depth")
+    assert open_sequence(tmp_path).layout == "replica"
+    (tmp_path / "traj.txt").write_text("0 0 0 0 0 0 0 1\n")
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    assert open_sequence(tmp_path).layout == "bundlesdf"
+
+
+# BOP -------------------------------------------------------------------------------------------
+
+
+def test_without_a_world_the_object_of_most_images_is_the_world(tmp_path):
+    T_world_object = np.eye(4)
+    T_world_object[:3, 3] = 0.2, -0.1, 2.0
+    write_bop(tmp_path, SEEN, w2c=False, T_world_object=T_world_object)
+    sequence = open_sequence(tmp_path)
+    assert "object 4" in sequence.findings[0].evidence
+    T = np.linalg.inv(T_world_object) @ SEEN.T_world_camera[3]
+    np.testing.assert_allclose(sequence[3].T_world_camera, T, atol=1e-9)
+    np.testing.assert_array_equal(sequence[3].mask, SEEN.mask[3])
+
+
+def test_depth_is_in_the_unit_of_the_scene(tmp_path):
+    write_bop(tmp_path, SEEN, unit=1.0)
+    assert open_sequence(tmp_path).depth_scale == 1000
+    about = json.loads((tmp_path / "scene_camera.json").read_text())
+    about["3"]["depth_scale"] = 0.5
+    (tmp_path / "scene_camera.json").write_text(json.dumps(about))
+    assert "[0.5, 1.0]" in fault_of(tmp_path)
+
+
+# Stray Scanner and Record3D --------------------------------------------------------------------
+
+
+def test_a_film_is_named_and_the_camera_is_of_its_size(tmp_path):
+    write_stray_scanner(tmp_path, SEEN, own_cameras=False, unpacked=False)
+    sequence = open_sequence(tmp_path)
+    assert "rgb.mp4" in sequence.findings[0].evidence and "ffmpeg" in sequence.findings[0].advice
+    np.testing.assert_allclose(sequence.intrinsics, SEEN.K[0])
+    assert sequence.camera == "camera_matrix.csv" and sequence.cameras is None
+    np.testing.assert_allclose(sequence.times, 5e4 + np.arange(5) / 60)
+
+
+def test_packed_record3d_files_are_refused_by_name(tmp_path):
+    (tmp_path / "scan.r3d").write_bytes(b"PK")
+    assert "LZFSE" in fault_of(tmp_path / "scan.r3d")
+
+
+def test_record3d_metadata_are_checked(tmp_path):
+    write_record3d(tmp_path, SEEN)
+    path = tmp_path / "metadata.json"
+    about = json.loads(path.read_text())
+    for change in ({"poses": [1, 2]}, {"w": None}, {"K": "x", "perFrameIntrinsicCoeffs": []}):
+        path.write_text(json.dumps(about | change))
+        assert "metadata.json gives no usable" in fault_of(tmp_path)
+
+
+def test_record3d_without_cameras_of_its_frames_has_one(tmp_path):
+    write_record3d(tmp_path, SEEN)
+    about = json.loads((tmp_path / "metadata.json").read_text())
+    del about["perFrameIntrinsicCoeffs"]
+    (tmp_path / "metadata.json").write_text(json.dumps(about))
+    sequence = open_sequence(tmp_path)
+    assert sequence.cameras is None
+    np.testing.assert_allclose(sequence[3].intrinsics, SEEN.K[0])
+
+
+# nerfstudio ------------------------------------------------------------------------------------
+
+
+def edit(folder, **entries):
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | entries))
+
+
+def test_a_scale_that_was_applied_to_the_poses_is_taken_back(tmp_path):
+    write_nerfstudio(tmp_path, SEEN, applied_scale=0.25)
+    T = open_sequence(tmp_path)[4].T_world_camera
+    np.testing.assert_allclose(T, SEEN.T_world_camera[4], atol=1e-9)
+
+
+def test_an_angle_of_view_and_images_without_suffix(tmp_path):
+    write_nerfstudio(tmp_path, SEEN)
+    about = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in about["frames"]:
+        frame["file_path"] = frame["file_path"].removesuffix(".png")
+        for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del frame[name]
+    angle = 2 * np.arctan(W / 2 / SEEN.K[0, 0, 0])
+    edit(tmp_path, frames=about["frames"], camera_angle_x=float(angle))
+    frame = open_sequence(tmp_path)[2]
+    np.testing.assert_allclose(frame.intrinsics, SEEN.K[0])
+    np.testing.assert_array_equal(frame.color, SEEN.color[2])
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/hostname", "depth/link.png", 7])
+def test_files_outside_of_the_recording_are_not_opened(tmp_path, name):
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    write_nerfstudio(folder, SEEN)
+    save(tmp_path / "secret.png", raw(SEEN.depth[0], 1000))
+    (folder / "depth/link.png").symlink_to(tmp_path / "secret.png")
+    about = json.loads((folder / "transforms.json").read_text())
+    about["frames"][0]["depth_file_path"] = name
+    edit(folder, frames=about["frames"])
+    assert repr(name) in fault_of(folder)
+
+
+def test_lenses_and_missing_depth_are_remarked(tmp_path):
+    write_nerfstudio(tmp_path, SEEN)
+    about = json.loads((tmp_path / "transforms.json").read_text())
+    del about["frames"][0]["depth_file_path"]
+    edit(tmp_path, frames=about["frames"], k1=-0.2)
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == 4
+    left, bent = (finding.evidence for finding in sequence.findings)
+    assert left.startswith("1 frames have no depth") and "-0.2" in bent
+
+
+# Arrays and floats -----------------------------------------------------------------------------
+
+
+def test_an_npz_file_can_be_given_itself(tmp_path):
+    write_npz(tmp_path, SEEN)
+    (tmp_path / "notes.txt").write_text("")
+    assert open_sequence(tmp_path / "scan.npz").layout == "npz"
+    assert "holds no recording" in fault_of(tmp_path)
+
+
+def test_arrays_that_do_not_fit_are_named(tmp_path):
+    path = tmp_path / "scan.npz"
+    for arrays, word in (
+        ({"K": OPENCV}, "depth"),
+        ({"depth": SEEN.depth, "K": OPENCV[:2]}, "(2, 3)"),
+        ({"depth": SEEN.depth, "K": OPENCV, "poses": np.eye(4)}, "poses"),
+        ({"depth": SEEN.depth, "K": OPENCV, "color": SEEN.color[:2]}, "color"),
+        ({"depth": np.array([{}], object), "K": OPENCV}, "pickle"),
+    ):
+        np.savez(path, **arrays)
+        assert word in fault_of(path)
+
+
+@pytest.mark.parametrize("folder", ["depth", "depths", "Depth", "aligned_depth_to_color"])
+@pytest.mark.parametrize("suffix", [".tif", ".npy"])
+def test_floats_are_metres_in_folders_of_any_usual_name(tmp_path, folder, suffix):
+    (tmp_path / folder).mkdir()
+    for i, depth in enumerate(SEEN.depth):
+        depth = depth.copy()
+        depth[:2, :3] = np.nan, 0, np.inf
+        if suffix == ".npy":
+            np.save(tmp_path / folder / f"{i}.npy", depth)
+        else:
+            save_float_tiff(tmp_path / folder / f"{i}.tif", depth)
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    frame = open_sequence(tmp_path)[3]
+    assert (frame.depth[:2, :3] == 0).all()
+    np.testing.assert_allclose(frame.depth[2:], SEEN.depth[3][2:], rtol=1e-6)
+
+
+@pytest.mark.parametrize("array", [np.zeros(5), np.zeros((2, 3, 4, 5)), np.array([["a"]])])
+def test_arrays_that_are_no_images_are_refused(tmp_path, array):
+    (tmp_path / "depth").mkdir()
+    np.save(tmp_path / "depth/0.npy", array)
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    assert "cannot be read as an image" in fault_of(tmp_path)
+
+
+def test_exr_is_read_or_refused_by_name(tmp_path):
+    (tmp_path / "depth").mkdir()
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    path = tmp_path / "depth/0.exr"
+    try:
+        import OpenEXR
+    except ImportError:
+        path.write_bytes(b"\x76\x2f\x31\x01")
+        assert "jaxshape[exr]" in fault_of(tmp_path)
+        return
+    depth = SEEN.depth[0].astype(np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"Y": depth}).write(str(path))
+    np.testing.assert_array_equal(open_sequence(tmp_path)[0].depth, depth)

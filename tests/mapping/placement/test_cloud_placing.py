@@ -1,0 +1,87 @@
+"""Clouds become F and M by rays, and are placed by the prior as they stand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxshape.data.boxes import Box
+from jaxshape.data.chairs import random_chair
+from jaxshape.data.clouds import Cloud
+from jaxshape.data.meshes import axes_to_canonical, sample_oriented
+from jaxshape.geometry.grid import GridFrame
+from jaxshape.mapping.placement.cloud_placing import PlacedCloud, cloud_grids, place_cloud
+from jaxshape.model.weights import load_prior
+
+N = 32
+FRAME = GridFrame(jnp.full(3, -0.5), jnp.full(3, 1 / N))
+
+
+def placed(metres=1.0):
+    return PlacedCloud(Box(np.eye(4), np.ones(3)), metres, "y", 0.0, ())
+
+
+def wall(side=0.6, count=200):
+    """A square in the plane z = 0.01, in the middle of voxels 16."""
+    x, y = np.meshgrid(*[np.linspace(-side / 2, side / 2, count)] * 2)
+    return np.stack([x, y, np.full_like(x, 0.01)], -1).reshape(-1, 3)
+
+
+def states(cloud, metres=1.0):
+    grids = cloud_grids(cloud, placed(metres), FRAME, N)
+    occupied, occluded = np.asarray(grids.occupied), np.asarray(grids.occluded)
+    assert not (occupied & occluded).any()
+    return occupied, ~(occupied | occluded)
+
+
+def test_a_sensor_frees_what_is_before_the_surface_and_nothing_behind():
+    points = wall()
+    occupied, free = states(Cloud(points, None, np.array([0.0, 0.0, 5.0])))
+    z = np.flatnonzero(occupied.any(axis=(0, 1)))
+    assert z.tolist() == [16]
+    assert not free[:, :, :17].any()
+    inside = occupied[:, :, 16]
+    assert free[inside][:, 18:].mean() > 0.9  # the rays that end in the wall
+    assert not free[:6].any() and not free[:, 27:].any()  # where no ray passes
+
+
+def test_normals_free_a_short_way_until_another_surface():
+    points, ahead = wall(), np.array([[0.0, 0.0, 1.0]])
+    near = points + [0.0, 0.0, 3 / N]
+    occupied, free = states(Cloud(points, np.repeat(ahead, len(points), 0), None))
+    inside = occupied[:, :, 16]
+    assert free[inside][:, 18:20].all()
+    assert not free[inside][:, 21:].any() and not free[:, :, :17].any()
+    both = np.concatenate([points, near])
+    sideways = points * [1, 1, 0] / np.linalg.norm(points[:, :2], axis=1, keepdims=True)
+    normals = np.concatenate([np.repeat(ahead, len(points), 0), sideways])
+    occupied, free = states(Cloud(both, normals, None))
+    assert free[inside][:, 18].all()
+    assert not free[inside][:, :16].any() and not free[inside][:, 20:].any()
+
+
+def test_without_rays_nothing_is_free_and_units_are_brought_to_metres():
+    occupied, free = states(Cloud(wall() * 1000, None, None), metres=0.001)
+    assert occupied[:, :, 16].sum() > 300 and not free.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("up, front, unit", [("z", "x", 1.0), ("-y", "z", 1000.0)])
+def test_a_chair_is_placed_as_it_stands(up, front, unit):
+    mesh = random_chair(3)
+    points, normals = sample_oriented(mesh, 20_000, 0)
+    R_file_object = axes_to_canonical(up, front).T
+    cloud = Cloud(
+        unit * (points @ R_file_object.T + [0.3, -2.0, 1.0]), normals @ R_file_object.T, None
+    )
+    found = place_cloud(cloud, load_prior())
+    assert found.up == up and found.metres == pytest.approx(1 / unit)
+    assert len(found.warnings) == (unit != 1)
+    T = found.box.T_world_object
+    np.testing.assert_allclose(T[:3, :3], R_file_object, atol=0.1)
+    np.testing.assert_allclose(T[:3, 3], [0.3, -2.0, 1.0], atol=0.05)
+    np.testing.assert_allclose(found.box.size, mesh.extents, atol=0.08)
+
+
+def test_axes_that_are_not_perpendicular_are_refused():
+    with pytest.raises(ValueError, match="must be perpendicular"):
+        place_cloud(Cloud(wall(), None, None), load_prior(), up="y", front="-y")

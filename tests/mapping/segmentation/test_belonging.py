@@ -1,0 +1,103 @@
+"""What belongs to the object: decided for all frames together, in a room that is known exactly."""
+
+import numpy as np
+import pytest
+from analytic_room import CHAIR, CRATE, FLOOR, HEIGHT, TABLE, WALLS, WIDTH, K, iou, room
+
+from jaxshape.data.boxes import Box
+from jaxshape.mapping.placement.faces import reach_of
+from jaxshape.mapping.segmentation.belonging import Seen, belonging
+from jaxshape.mapping.segmentation.parts import parts_of
+
+GROUPS = [FLOOR, WALLS, CHAIR, TABLE]
+OURS, ITS_TABLE = 2, 3
+EYES = [(0.9, 1.4, 1.8), (0.1, 1.6, 1.9), (-0.7, 1.3, 2.0)]
+CLOSE = (0.5, 1.25, 0.9), (0, 0.85, 0)
+"""A camera that sees the back and the seat alone."""
+ABOVE_FLOOR = np.array([[[-9, -9, -9], [9, 0.02, 9]]], float)
+"""What lies lower is floor."""
+
+
+def box_of(low, high):
+    """A box of this room, with the floor excluded from it."""
+    low, high = np.array(low, float), np.array(high, float)
+    T = np.eye(4)
+    T[:3, 3] = (low + high) / 2
+    return Box(T, high - low, ABOVE_FLOOR - T[:3, 3])
+
+
+WHOLE = box_of((-0.25, 0, -0.25), (0.25, 0.96, 0.25))
+SHORT = box_of((-0.25, 0.4, -0.25), (0.25, 0.96, 0.25))
+
+
+def in_the_world(view):
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T
+    z = np.where(np.isfinite(view.depth), view.depth, np.nan)
+    T = view.T_world_camera
+    return (rays * z[..., None]) @ T[:3, :3].T + T[:3, 3]
+
+
+def seen(view, sure=None):
+    parts = parts_of(view.depth, K, sure)
+    return Seen(in_the_world(view), parts.labels, parts.sure)
+
+
+def found_in(views, box, first=OURS):
+    """The object's pixels, where those of the first view are known."""
+    frames = [seen(view) for view in views]
+    frames[0] = frames[0]._replace(sure=views[0].label == first)
+    return belonging(frames, box, *reach_of(box))
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [room(GROUPS, *CLOSE), *(room(GROUPS, eye, seed=i) for i, eye in enumerate(EYES))]
+
+
+@pytest.mark.parametrize("box", [WHOLE, SHORT], ids=["whole", "short"])
+def test_a_box_that_was_cut_short_excludes_nothing_of_the_chair(views, box):
+    for view, found in zip(views[1:], found_in(views, box)[1:], strict=True):
+        chair = (view.label == OURS) & (in_the_world(view)[..., 1] > 0.06)
+        assert found[chair].mean() > 0.95
+        assert not found[view.label == ITS_TABLE].any()
+        assert iou(found, view.label == OURS) > 0.85
+
+
+def test_the_table_beside_is_not_the_chair_though_it_is_within_reach(views):
+    reach, _ = reach_of(SHORT)
+    assert reach.size[0] / 2 > 0.6  # where the table begins
+    assert all(not found[v.label == ITS_TABLE].any()
+               for v, found in zip(views, found_in(views, SHORT), strict=True))  # fmt: skip
+
+
+def test_a_view_that_shows_the_table_alone_shows_nothing_of_the_chair(views):
+    away = room(GROUPS, (1.6, 1.3, 1.2), (1.5, 0.4, -0.5))
+    assert not (away.label == OURS).any()
+    assert not found_in([*views, away], SHORT)[-1].any()
+
+
+def test_a_cluster_of_the_chair_and_a_crate_is_cut_where_others_show_the_crate_alone():
+    """As where both touch, or where depth is too coarse to tell one from the other."""
+    views = [room([*GROUPS, CRATE], *CLOSE)]
+    views += [room([*GROUPS, CRATE], eye, seed=i) for i, eye in enumerate(EYES)]
+    frames = [seen(view) for view in views]
+    frames[0] = frames[0]._replace(sure=views[0].label == OURS)
+    labels = frames[-1].labels.copy()
+    both = np.isin(labels, labels[np.isin(views[-1].label, (OURS, 4))]) & (labels > 0)
+    labels[both] = labels.max() + 1
+    frames[-1] = frames[-1]._replace(labels=labels)
+    found = belonging(frames, WHOLE, *reach_of(WHOLE))[-1]
+    chair = (views[-1].label == OURS) & (in_the_world(views[-1])[..., 1] > 0.06)
+    assert found[chair].mean() > 0.9 and both[views[-1].label == 4].any()
+    assert not found[views[-1].label == 4].any()
+
+
+def test_far_from_the_object_and_without_depth_nothing_is_found(views):
+    blind = views[1]._replace(depth=np.zeros_like(views[1].depth))
+    assert not found_in([*views, blind], WHOLE)[-1].any()
+    shift = WHOLE.T_world_object.copy()
+    shift[0, 3] -= 6
+    frames = [seen(view) for view in views]
+    elsewhere = WHOLE._replace(T_world_object=shift)
+    assert not any(one.any() for one in belonging(frames, elsewhere, *reach_of(elsewhere)))
