@@ -80,7 +80,7 @@ def test_without_a_point_of_the_object_there_are_no_faces():
 
 def test_the_reach_holds_the_box_and_stops_at_what_is_excluded():
     slab = [[[-9, -9, -9], [9, -0.4, 9]]]
-    reach, column = reach_of(box_of(*TRUE, slab))
+    reach, column = reach_of(box_of(TRUE[0], TRUE[1], slab))
     inside = np.random.default_rng(0).uniform(TRUE[0], TRUE[1], (200, 3))
     inside = inside[inside[:, 1] > 0.475 - 0.4]
     assert points_in_box(inside, reach).all() and points_in_box(inside, column).all()
