@@ -320,7 +320,7 @@ def _height_at(floor: Plane, start: Start) -> float:
     """Height, in the level frame, of a floor below the middle of the box."""
     assert start.T_level_world is not None
     middle = start.box.T_world_object[:3, 3]
-    below = middle - height_above(floor, middle) * floor.normal
+    below = middle - (floor.normal @ middle + floor.offset) * floor.normal
     return float((start.T_level_world[:3, :3] @ below + start.T_level_world[:3, 3])[1])
 
 

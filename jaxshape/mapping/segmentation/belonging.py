@@ -48,7 +48,16 @@ class Seen(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """One part: the frame it is in, its label, some of its points, and how they lie."""
+    """One part of a frame, and how it lies.
+
+    Attributes:
+        frame: Number of the frame that it is in.
+        label: Its label in that frame.
+        points: Some of its points, in the world `[n 3]`.
+        in_box: Share of it in the box of the object.
+        in_reach: Share of it within the reach of the object.
+        in_column: Share of it in the reach above and below the box.
+    """
 
     frame: int
     label: int
@@ -59,7 +68,12 @@ class _Part(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What was measured, in trees that find the nearest point: the object, and other things."""
+    """What was measured, in trees that find the nearest point.
+
+    Attributes:
+        ours: Points of the object.
+        others: Points of other things.
+    """
 
     ours: KDTree
     others: KDTree
