@@ -59,7 +59,9 @@ class Complete(Rebuild):
             cloud = cloud._replace(sensor=np.array(self.sensor))
         prior, refiner, config = self.prepare()
         with console.status("finding which way is up"):
-            placed = place_cloud(cloud, prior, up=self.up, front=self.front, seed=self.seed)
+            placed = place_cloud(
+                cloud, self.placer(prior), up=self.up, front=self.front, seed=self.seed
+            )
         warnings = [*placed.warnings, *_of_rays(cloud)]
         for warning in warnings:
             console.print(f"[yellow]warning[/] {escape(warning)}", highlight=False, soft_wrap=True)

@@ -48,6 +48,17 @@ class Rebuild:
         prior = load_prior(self.weights)
         return prior, refiner_for(self.method_for(prior), prior, self.search), self.search
 
+    def placer(self, prior: Any) -> Any:
+        """The prior that finds an object's frame.
+
+        For the package's chairs that is the auto-encoder. It finds fronts and sizes better, in half
+        the time: a decoder that knows the measurement explains it in any frame.
+        """
+        from jaxshape.model.weights import load_prior
+
+        packaged = self.weights is None or str(self.weights) == "chair"
+        return load_prior("chair-autoencoder") if packaged else prior
+
     def method_for(self, prior: Any) -> str:
         """The method that was asked for, or the usual one of the prior."""
         from jaxshape.search.reconstruction import usual_method

@@ -91,6 +91,7 @@ class Reconstruct(Rebuild):
         require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
         require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")
         prior, refiner, search = self.prepare()
+        placer = self.placer(prior)
         sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
         with console.status("inspecting the recording"):
             inspected = self._inspected(sequence)
@@ -130,7 +131,7 @@ class Reconstruct(Rebuild):
             with console.status("finding the object"):
                 found = find_start(
                     sequence,
-                    prior,
+                    placer,
                     prompt,
                     box=box,
                     first=self.first,
@@ -149,7 +150,7 @@ class Reconstruct(Rebuild):
                 sequence,
                 found,
                 mapper,
-                prior,
+                placer,
                 chosen=chosen,
                 use_poses=use_poses,
                 earlier=earlier,
