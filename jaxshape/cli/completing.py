@@ -82,7 +82,7 @@ class Complete(Rebuild):
             T_world_object=np.diag([1 / placed.metres] * 3 + [1.0]) @ T,
             truth=None,
         )
-        figures: dict[str, Any] = {"object": str(self.scan), **self.settings("points")}
+        figures: dict[str, Any] = {"object": str(self.scan), **self.settings(prior, "points")}
         figures |= {"points": len(cloud.points), "up": placed.up, "metres_in_a_unit": placed.metres}
         figures["box"] = {"T_world_object": T.tolist(), "size": placed.box.size.tolist()}
         figures |= {"warnings": warnings, "seconds": round(time.perf_counter() - start, 2)}
