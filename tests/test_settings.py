@@ -44,7 +44,7 @@ WRONG = {
     PlacementConfig: {"typical_size": ((0.5, 0.0, 0.5),), "size_spread": ((0.5, math.nan, 0.5),),
                       "yaws": COUNT, "overhangs": ((0.0, -0.2),), "kept": (*COUNT, 1000),
                       "steps": COUNT, "steps_again": COUNT},
-    Prompt: {"click": ((-1.0, 5.0), (math.nan, 5.0)),
+    Prompt: {"number": COUNT, "click": ((-1.0, 5.0), (math.nan, 5.0)),
              "region": ((30.0, 0.0, 20.0, 10.0), (0.0, 5.0, 9.0, 5.0)),
              "depth_range": ((2.0, 1.0), (-1.0, 2.0), (1.0, math.nan))},
 }  # fmt: skip

@@ -114,15 +114,15 @@ def test_all_processes_refuse_what_the_first_one_finds(two_processes):
 def test_the_noise_of_a_code_is_that_of_its_place_in_the_whole_batch():
     @jax.jit
     def draw(step):
-        part = lambda _: training._code_noise(step, 100, config, "batch")  # noqa: E731
+        part = lambda _: training._noise(step, 100, config, "batch")  # noqa: E731
         parts = jax.vmap(part, axis_name="batch")(jnp.arange(2))
-        return training._code_noise(step, 200, config, None), jnp.concatenate(parts)
+        return training._noise(step, 200, config, None), jnp.concatenate(parts)
 
     config = tiny_training.CONFIG
     whole, parts = draw(3)
     np.testing.assert_array_equal(parts, whole)
     assert len(np.unique(whole)) > 0.99 * whole.size
-    np.testing.assert_allclose(np.std(whole), config.code_noise, rtol=0.1)
+    np.testing.assert_allclose(np.std(whole), 1, rtol=0.1)
     assert np.mean(draw(4)[0] == whole) < 0.01
 
 
