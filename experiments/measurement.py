@@ -4,7 +4,7 @@ r"""What frames measure, as points in voxels (paper, Eq. 6) and as fused signed 
 
 The 78 CAD seats, seen by a Kinect's noisy frames along an orbit. F is compared with the true
 surface voxels; the oracle is F with its occluded voxels filled from the truth, the best that any
-prior could reach on top. Then the shipped weights propose a shape, Adam refines it in 60 steps, and
+prior could reach on top. Then the auto-encoder proposes a shape, Adam refines it in 60 steps, and
 measured and decoded shape are composed: from points by F and M, from distances by their
 probabilities, and with the mirror image as further evidence.
 
