@@ -5,7 +5,8 @@ Depth frames are fused into a measurement grid **F** and an occlusion mask **M**
 a first code, and the code is searched, by CMA-ES populations or by gradients, until the decoded
 grid agrees with what was measured where something was measured, and with the prior elsewhere. After
 Hu, Cao, Wu and Kneip, "Dense Object Reconstruction from RGBD Images with Embedded Deep Shape
-Representations" (2018); "the paper" in all docstrings.
+Representations" (2018); "the paper" in all docstrings. The default prior goes further: its decoder
+takes F and M, so that its first code fills what is hidden without a search.
 
 Conventions, stated here once:
 
@@ -32,7 +33,7 @@ Data moves one way, and so do imports:
 
     geometry   cameras, voxel frames, fusion of frames into F and M or signed distances
     data       meshes, procedural chairs, virtual depth camera, training pairs, RGB-D recordings
-    model      convolutions, auto-encoder, weights, training
+    model      convolutions, auto-encoder, conditional network, weights, training
     search     objective (Eq. 7), refiners, the batched search, composed shapes
     mapping    segmentation, the object's frame, ICP, keyframes, realignment of a recording
     results    surfaces, metrics, evaluation, the files of a result
