@@ -19,6 +19,11 @@ def require(condition: bool, sentence: str) -> None:
         raise BadInput(sentence)
 
 
+def warn(sentence: str) -> None:
+    """Print a warning."""
+    console.print(f"[yellow]warning[/] {escape(sentence)}", highlight=False, soft_wrap=True)
+
+
 def progress_bar(unit: str) -> Progress:
     """A bar with counts, the time left, and a free text."""
     return Progress(

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
 from tyro.conf import Positional
 
-from jaxshape.cli.common import console, require
-from jaxshape.cli.rebuild import Rebuild, report_objective
+from jaxshape.cli.common import console, require, warn
+from jaxshape.cli.rebuild import Rebuild, report_objective, written
 from jaxshape.data.config import Axis
 
 
@@ -41,16 +40,13 @@ class Complete(Rebuild):
 
     def run(self) -> None:
         start = time.perf_counter()
-        import jax
         import numpy as np
 
         from jaxshape.data.clouds import read_cloud
         from jaxshape.mapping.placement.cloud_placing import cloud_grids, place_cloud
         from jaxshape.mapping.tracking.keyframes import place_of
-        from jaxshape.report.page import write_report
-        from jaxshape.report.panels import write_overview
-        from jaxshape.results.output import Observation, write_result
-        from jaxshape.search.reconstruction import reconstruct_jit, require_measured
+        from jaxshape.results.output import Observation
+        from jaxshape.search.reconstruction import require_measured
 
         require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
         cloud = read_cloud(self.scan, seed=self.seed)
@@ -64,15 +60,11 @@ class Complete(Rebuild):
             )
         warnings = [*placed.warnings, *_of_rays(cloud)]
         for warning in warnings:
-            console.print(f"[yellow]warning[/] {escape(warning)}", highlight=False, soft_wrap=True)
+            warn(warning)
         frame = place_of(placed.box, prior.resolution).frame
         grids = cloud_grids(cloud, placed, frame, prior.resolution, seed=self.seed)
         require_measured(np.asarray(grids.occupied))
-        with console.status("searching the space of shapes"):
-            run = reconstruct_jit(refiner, config)
-            key = jax.random.key(self.seed)[None]
-            found = run(key, prior, grids.occupied[None], grids.occluded[None])
-            found = jax.block_until_ready(found)
+        found = self.searched(prior, refiner, config, grids)
         T = placed.box.T_world_object
         observation = Observation(
             depth=[],
@@ -86,10 +78,7 @@ class Complete(Rebuild):
         figures |= {"points": len(cloud.points), "up": placed.up, "metres_in_a_unit": placed.metres}
         figures["box"] = {"T_world_object": T.tolist(), "size": placed.box.size.tolist()}
         figures |= {"warnings": warnings, "seconds": round(time.perf_counter() - start, 2)}
-        with console.status("drawing"):
-            result = write_result(self.output, observation, found, figures)
-            write_overview(self.output, observation, found, result)
-            write_report(self.output)
+        result = written(self.output, observation, found, figures)
         size = " x ".join(f"{extent:.2f}" for extent in placed.box.size)
         print(f"{len(cloud.points)} points of an object of {size} m, {placed.up} is up")
         report_objective(result)

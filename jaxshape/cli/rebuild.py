@@ -71,6 +71,37 @@ class Rebuild:
         search = asdict(self.search) | {"objective": objective}
         return {"method": self.method_for(prior), "seed": self.seed, "search": search}
 
+    def searched(self, prior: Any, refiner: Any, config: RefineConfig, grids: Any) -> Any:
+        """The `Reconstruction` of one object, a batch of one, from its F and M (`Grids`)."""
+        import jax
+
+        from jaxshape.search.reconstruction import reconstruct_jit
+
+        with console.status("searching the space of shapes"):
+            run = reconstruct_jit(refiner, config)
+            key = jax.random.key(self.seed)[None]
+            found = run(key, prior, grids.occupied[None], grids.occluded[None])
+            return jax.block_until_ready(found)
+
+
+def written(folder: Path, observation: Any, found: Any, figures: dict[str, Any]) -> dict[str, Any]:
+    """Write the files of a result, its picture and its report; the content of result.json."""
+    from jaxshape.results.output import write_result
+
+    with console.status("drawing"):
+        result = write_result(folder, observation, found, figures)
+        draw(folder, observation, found, result)
+    return result
+
+
+def draw(folder: Path, observation: Any, found: Any, result: dict[str, Any]) -> None:
+    """Write the picture and the report of a result whose other files are written."""
+    from jaxshape.report.page import write_report
+    from jaxshape.report.panels import write_overview
+
+    write_overview(folder, observation, found, result)
+    write_report(folder)
+
 
 def report_objective(result: dict[str, Any]) -> None:
     """Print the objective before and after the search."""
@@ -103,13 +134,8 @@ class Demo(Rebuild):
 
     def run(self) -> None:
         start = time.perf_counter()
-        import jax
-
         from jaxshape.data.dataset import TEST_SEEDS
-        from jaxshape.report.page import write_report
-        from jaxshape.report.panels import write_overview
-        from jaxshape.results.output import write_result
-        from jaxshape.search.reconstruction import reconstruct_jit, require_measured
+        from jaxshape.search.reconstruction import require_measured
 
         require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
         require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
@@ -118,19 +144,12 @@ class Demo(Rebuild):
         with console.status("filming a chair"):
             grids, observation = self.film(seen, prior.resolution)
         require_measured(observation.occupied)
-        with console.status("searching the space of shapes"):
-            run = reconstruct_jit(refiner, config)
-            key = jax.random.key(self.seed)[None]
-            batch = jax.tree.map(lambda x: x[None], grids)
-            found = jax.block_until_ready(run(key, prior, batch.occupied, batch.occluded))
+        found = self.searched(prior, refiner, config, grids)
         figures = {"object": f"procedural chair {TEST_SEEDS + self.seed}", "frames": self.frames}
         figures |= {"camera": seen.camera, "noise": seen.is_noisy, "fusion": seen.fused_by}
         figures |= self.settings(prior, seen.fused_by)
         figures |= {"seconds": round(time.perf_counter() - start, 2)}
-        with console.status("drawing"):
-            result = write_result(self.output, observation, found, figures)
-            write_overview(self.output, observation, found, result)
-            write_report(self.output)
+        result = written(self.output, observation, found, figures)
         report_objective(result)
         print(f"wrote mesh.glb, grid.npz, result.json, overview.png, report.html to {self.output}")
         print(

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.markup import escape
 from tyro.conf import Positional
 
-from jaxshape.cli.common import console, progress_bar, require
+from jaxshape.cli.common import console, progress_bar, require, warn
 from jaxshape.cli.inspecting import ConventionName
-from jaxshape.cli.rebuild import Rebuild, report_objective
+from jaxshape.cli.rebuild import Rebuild, draw, report_objective
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 
 
@@ -123,7 +122,7 @@ class Reconstruct(Rebuild):
         }
         figures["warnings"] = [warning.sentence for warning in inspected.warnings]
         for warning in figures["warnings"]:
-            console.print(f"[yellow]warning[/] {escape(warning)}", highlight=False, soft_wrap=True)
+            warn(warning)
         earlier = None
         if not self.fresh:
             earlier = load_state(self.output, sequence, prior, settings, self.mapping)
@@ -231,15 +230,12 @@ class Reconstruct(Rebuild):
 
     def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
         """Draw the pictures and the report, and print a summary."""
-        from jaxshape.report.page import write_report
-        from jaxshape.report.panels import write_overview
         from jaxshape.results.progress import observation_of
         from jaxshape.results.summary import verdict_in_words
 
         observation = observation_of(progress.state)
         with console.status("drawing"):
-            write_overview(self.output, observation, progress.shape, result)
-            write_report(self.output)
+            draw(self.output, observation, progress.shape, result)
         lost = result["frames_lost"] + result["frames_unreadable"]
         print(
             f"{result['frames']} frames, {result['keyframes']} of them keyframes, {lost} left out"

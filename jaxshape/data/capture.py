@@ -1,8 +1,8 @@
 """One object seen by the virtual camera: depth frames, measurements, ground truth. [host]"""
 
 import math
+from collections.abc import Iterator
 from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,7 @@ from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.distance import DistanceField
-from jaxshape.geometry.fusing import Distances, Fusion, fuse, fuse_cumulative
+from jaxshape.geometry.fusing import Distances, Fusion, fuse_in_stages
 from jaxshape.geometry.fusion import Measurement
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.geometry.grids import Grids
@@ -85,8 +85,23 @@ def capture(
         rng = np.random.default_rng(seed)
         depth = render.add_sensor_noise(depth, cosine, rng, camera.noise)
     frame = grid.fit_box(*jnp.float32(mesh.bounds), resolution=resolution)
+    surface = true_surface(mesh, frame, seed, resolution)
+    return Capture(depth, intrinsics, T_object_camera, frame, surface)
+
+
+def true_surface(
+    mesh: trimesh.Trimesh, frame: GridFrame, seed: int, resolution: int
+) -> Bool[Array, "x y z"]:
+    """Surface voxels of a CAD model: the ground truth **Y**.
+
+    Args:
+        mesh: The mesh, in the object frame.
+        frame: Voxel frame of the grid.
+        seed: Seed of the surface samples, 0 or more.
+        resolution: Voxels along each axis of the grid.
+    """
     points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
-    return Capture(depth, intrinsics, T_object_camera, frame, discretize(points, frame, resolution))
+    return discretize(points, frame, resolution)
 
 
 def camera_distance(mesh: trimesh.Trimesh, camera: VirtualCamera = PAPER) -> float:
@@ -161,17 +176,17 @@ def fused_grids(
     Returns:
         Grids `[len(numbers) x y z]`.
     """
-    depth = jnp.asarray(captured.depth)
-    return fuse_cumulative(
-        fusing,
-        numbers,
-        depth,
-        jnp.isfinite(depth),
-        captured.intrinsics,
-        captured.T_object_camera,
-        captured.frame,
-        sensor,
-    )
+    states = _stages(captured, fusing, numbers, sensor)
+    return jax.tree.map(lambda *x: jnp.stack(x), *map(fusing.grids, states))
+
+
+def _stages(
+    captured: Capture, fusing: Fusion, numbers: tuple[int, ...], sensor: Sensor
+) -> Iterator[Any]:
+    """States of the first frames of a capture, of which every pixel that hit shows the object."""
+    depth, T = jnp.asarray(captured.depth), captured.T_object_camera
+    seen, intrinsics = jnp.isfinite(depth), captured.intrinsics
+    return fuse_in_stages(fusing, numbers, depth, seen, intrinsics, T, captured.frame, sensor)
 
 
 @partial(jax.jit, static_argnames=("fusing", "sensor"))
@@ -183,9 +198,7 @@ def fused_frames(captured: Capture, fusing: Fusion, sensor: Sensor = Sensor()) -
         fusing: The way to fuse them.
         sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
     """
-    depth = jnp.asarray(captured.depth)
-    seen, T = jnp.isfinite(depth), captured.T_object_camera
-    state = fuse(fusing, depth, seen, captured.intrinsics, T, captured.frame, sensor)
+    (state,) = _stages(captured, fusing, (len(captured.depth),), sensor)
     return state, fusing.grids(state)
 
 
@@ -205,11 +218,5 @@ def fuse_frames(
     Returns:
         One field for each number of frames `[len(frames) n n n]`.
     """
-    depth = jnp.asarray(captured.depth)
-    all_frames = depth, jnp.isfinite(depth), captured.T_object_camera
-    fusing, field, found = Distances(captured.surface.shape[-1]), None, []
-    for ends in pairwise((0, *frames)):
-        depth, seen, T = jax.tree.map(lambda x, ends=ends: x[slice(*ends)], all_frames)
-        field = fuse(fusing, depth, seen, captured.intrinsics, T, captured.frame, sensor, field)
-        found.append(field)
-    return jax.tree.map(lambda *x: jnp.stack(x), *found)
+    fields = _stages(captured, Distances(captured.surface.shape[-1]), frames, sensor)
+    return jax.tree.map(lambda *x: jnp.stack(x), *fields)

@@ -17,17 +17,16 @@ from jaxtyping import Array, Bool, Float
 from jaxshape.data import meshes, render
 from jaxshape.data.capture import (
     GRID_MARGIN,
-    SURFACE_SAMPLES,
     camera_distance,
-    discretize,
     sensor_of,
+    true_surface,
 )
 from jaxshape.data.config import DatasetConfig
 from jaxshape.data.faults import Frames, with_faults
 from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera
 from jaxshape.geometry import camera, grid
 from jaxshape.geometry.camera import Intrinsics
-from jaxshape.geometry.fusing import Fusion, fuse_cumulative, fusion_named
+from jaxshape.geometry.fusing import Fusion, fuse_in_stages, fusion_named
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
@@ -72,8 +71,7 @@ def draw_path(mesh: trimesh.Trimesh, config: DatasetConfig, seed: int) -> Path:
     frame = grid.fit_box(*jnp.float32(box), resolution=config.resolution)
     fusing = fusion_named("points" if name == "paper" else "distance", config.resolution)
     measured = _fused(padded(frames), intrinsics, frame, fusing, config.frames, sensor_of(kind))
-    points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
-    return Path(discretize(points, frame, config.resolution), measured)
+    return Path(true_surface(mesh, frame, seed, config.resolution), measured)
 
 
 def draw_poses(
@@ -121,6 +119,7 @@ def _fused(
     sensor: Sensor,
 ) -> Grids:
     depth, segmented = jnp.asarray(frames.depth), jnp.asarray(frames.segmented)
-    return fuse_cumulative(
+    states = fuse_in_stages(
         fusing, numbers, depth, segmented, intrinsics, frames.T_object_camera, frame, sensor
     )
+    return jax.tree.map(lambda *x: jnp.stack(x), *map(fusing.grids, states))

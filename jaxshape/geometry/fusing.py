@@ -9,12 +9,12 @@ distances on a fine grid, for depth that is real or noisy. Both are static under
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, get_args
 
 import jax
-import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
@@ -136,7 +136,7 @@ def fusion_named(name: FusionName, resolution: int = RESOLUTION, min_hits: int =
     Raises:
         ValueError: There is none of that name, or a number is outside its range.
     """
-    checks.one_of("fusion", name, ("distance", "points"))
+    checks.one_of("fusion", name, get_args(FusionName))
     return Points(resolution, min_hits) if name == "points" else Distances(resolution)
 
 
@@ -174,7 +174,7 @@ def fuse(
     return jax.lax.scan(add, earlier, (depth, segmented, T_object_camera))[0]
 
 
-def fuse_cumulative(
+def fuse_in_stages(
     fusing: Fusion,
     numbers: tuple[int, ...],
     depth: Float[Array, "frame h w"],
@@ -183,8 +183,8 @@ def fuse_cumulative(
     T_object_camera: jaxlie.SE3,
     frame: GridFrame,
     sensor: Sensor = Sensor(),
-) -> Grids:
-    """F and M of the first k frames, for each k of an increasing tuple.
+) -> Iterator[Any]:
+    """The state of the first k frames, for each k of an increasing tuple.
 
     Args:
         fusing: The way to fuse them.
@@ -196,13 +196,11 @@ def fuse_cumulative(
         frame: Voxel frame of F and M.
         sensor: How the camera's noise grows.
 
-    Returns:
-        Grids `[len(numbers) x y z]`.
+    Yields:
+        The states, in the order of the numbers.
     """
-    frames = depth, segmented, T_object_camera
-    state, found = fusing.nothing(), []
+    frames, state = (depth, segmented, T_object_camera), fusing.nothing()
     for ends in pairwise((0, *numbers)):
         depth, segmented, T = jax.tree.map(lambda x, ends=ends: x[slice(*ends)], frames)
         state = fuse(fusing, depth, segmented, intrinsics, T, frame, sensor, state)
-        found.append(fusing.grids(state))
-    return jax.tree.map(lambda *x: jnp.stack(x), *found)
+        yield state

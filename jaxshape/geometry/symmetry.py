@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxshape.geometry.evidence import Evidence
@@ -28,7 +29,7 @@ class Mirrored(NamedTuple):
     agreement: Float[Array, "*batch"]
 
 
-def mirror(x: Array) -> Array:
+def mirror(x: Array | np.ndarray) -> Array:
     """The grid of the object with left and right exchanged."""
     return jnp.flip(x, axis=-3)
 

@@ -4,9 +4,10 @@ Nothing here imports JAX, so that the command line answers at once.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from jaxshape import checks
+from jaxshape.geometry.config import FusionName
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class MappingConfig:
     keyframe_distance: float = 0.25
     realign: bool = True
     isotropic: bool = False
-    fusion: Literal["distance", "points"] = "distance"
+    fusion: FusionName = "distance"
     depth_noise: float = 1.6e-3
     min_hits: int = 3
     keyframe_iterations: int = 40
@@ -87,7 +88,7 @@ class MappingConfig:
         checks.positive("keyframe_distance", self.keyframe_distance, "metres")
         for switch in ("realign", "isotropic"):
             checks.one_of(switch, getattr(self, switch), (True, False))
-        checks.one_of("fusion", self.fusion, ("distance", "points"))
+        checks.one_of("fusion", self.fusion, get_args(FusionName))
         checks.positive("depth_noise", self.depth_noise, "metres")
         checks.whole("min_hits", self.min_hits, 1)
         checks.whole("keyframe_iterations", self.keyframe_iterations, 1)

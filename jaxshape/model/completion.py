@@ -17,7 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from jaxshape.geometry.grids import Grid, Grids
+from jaxshape.geometry.evidence import from_grids
+from jaxshape.geometry.grids import Grids
+from jaxshape.geometry.symmetry import mirror
 from jaxshape.model.config import Completion
 from jaxshape.model.shapes import Precision, Prepared, ShapeModel
 from jaxshape.model.stencil import convolve, multiply
@@ -168,9 +170,8 @@ def evidence_of(grids: Grids) -> Float[Array, "b x y z 4"]:
     Many objects are symmetric. What was measured on one side of them is then known of the other,
     and the network learns how far to believe it.
     """
-    F, M = (jnp.asarray(x).astype(jnp.float32) for x in grids[:2])
-    here = jnp.stack([F * (1 - M), (1 - F) * (1 - M)], axis=-1)
-    return jnp.concatenate([here, jnp.flip(here, axis=1)], axis=-1)
+    seen = from_grids(grids)
+    return jnp.stack([*seen, *map(mirror, seen)], axis=-1)
 
 
 def skips(params: PyTree, grids: Grids, dtype: Any = jnp.float32) -> Skips:
@@ -231,7 +232,7 @@ def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepar
         n = architecture_of(params).resolution
         grids = Grids(jnp.zeros((1, n, n, n)), jnp.ones((1, n, n, n)))
     dtype = jnp.bfloat16 if precision == "bfloat16" else jnp.float32
-    sides = [skips(params, Grids(*side)) for side in (grids[:2], map(_mirrored, grids[:2]))]
+    sides = [skips(params, Grids(*side)) for side in (grids[:2], map(mirror, grids[:2]))]
     own = jax.tree.map(lambda x: x.astype(dtype), sides)
     return Prepared({"decoder": params["decoder"]}, own)
 
@@ -243,12 +244,7 @@ def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y
     measurement then gets the mirror image of the answer.
     """
     here, there = (decode_skips(prepared.shared, side, code) for side in prepared.own)
-    return (here + _mirrored(there)) / 2
-
-
-def _mirrored(grid: Grid) -> Grid:
-    """Left and right exchanged."""
-    return jnp.flip(grid, axis=-3)
+    return (here + mirror(there)) / 2
 
 
 def architecture_of(params: PyTree) -> Completion:

@@ -191,7 +191,7 @@ def _in_cache(values: int) -> int:
     return max(1, CACHE_BYTES // (4 * values))
 
 
-def _matmul(a, b):
+def matmul(a, b):
     """Products of bfloat16 gather in float32, which is also faster on CPU than in bfloat16."""
     return jnp.matmul(a, b, preferred_element_type=jnp.float32)
 
@@ -199,14 +199,14 @@ def _matmul(a, b):
 def _gather_taps_then_multiply(fine, kernel):
     """Gather the taps along y and z, then add up one product per tap along x."""
     matrices = kernel.reshape(KERNEL_SIZE, -1, kernel.shape[-1])
-    return reduce(jnp.add, map(_matmul, _gather_taps(fine), matrices)).astype(fine.dtype)
+    return reduce(jnp.add, map(matmul, _gather_taps(fine), matrices)).astype(fine.dtype)
 
 
 def _gradient_of_taps(fine, coarse):
     """Products of the gathered taps with the coarse side, summed over examples."""
     columns = coarse.reshape(-1, coarse.shape[-1])
     planes = _gather_taps(fine)
-    return jnp.stack([_matmul(plane.reshape(columns.shape[0], -1).T, columns) for plane in planes])
+    return jnp.stack([matmul(plane.reshape(columns.shape[0], -1).T, columns) for plane in planes])
 
 
 def _gather_taps(
@@ -236,7 +236,7 @@ def _gather_then_multiply(kernel) -> Callable[[Array], Array]:
         x = jnp.concatenate([x[:, :, :, 1 + d : 1 + d + nz] for d in TAPS], axis=-1)
         phases: dict[tuple, Any] = dict.fromkeys(itertools.product(PHASES, repeat=2), 0.0)
         for (dx, dy), matrix in zip(shifts, matrices, strict=True):
-            product = _matmul(x[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny], matrix)
+            product = matmul(x[:, 1 + dx : 1 + dx + nx, 1 + dy : 1 + dy + ny], matrix)
             for i, phase in enumerate(_taps((dx, dy))):
                 phases[phase] += product[..., 2 * fine * i : 2 * fine * (i + 1)]
         return _interleave(jnp.stack(list(phases.values()), axis=4), fine).astype(kernel.dtype)

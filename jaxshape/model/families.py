@@ -60,6 +60,8 @@ class Family(NamedTuple):
         params: `variables -> ` parameters of the shape model.
         variables: The inverse of `params`.
         architecture_of: Sizes of the network that parameters of the shape model are of.
+        codes_are_normal: Whether codes have mean 0 and covariance 1 by the way they are trained, so
+            that their statistics need not be measured.
     """
 
     model: ShapeModel
@@ -68,6 +70,7 @@ class Family(NamedTuple):
     params: Callable[[dict[str, PyTree]], PyTree]
     variables: Callable[[PyTree], dict[str, PyTree]]
     architecture_of: Callable[[PyTree], Any]
+    codes_are_normal: bool = False
 
 
 def family_of(architecture: Architecture | Completion) -> Family:
@@ -145,4 +148,5 @@ COMPLETIONS = Family(
     params=lambda variables: variables["params"],
     variables=lambda params: {"params": params},
     architecture_of=completion.architecture_of,
+    codes_are_normal=True,
 )

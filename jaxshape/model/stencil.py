@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxshape.model.chunks import in_chunks, sum_chunks
+from jaxshape.model.convolution import matmul
 
 SIZE = 3
 CACHE_BYTES = 2**19
@@ -60,7 +61,7 @@ def _products(grid, kernel):
     matrices = kernel.reshape(SIZE**2, -1, kernel.shape[-1])
 
     def of_some(grid):
-        products = map(_matmul, _shifts(grid), matrices)
+        products = map(matmul, _shifts(grid), matrices)
         return reduce(jnp.add, products).astype(grid.dtype)
 
     return in_chunks(of_some, _in_cache(grid), grid)
@@ -70,7 +71,7 @@ def _gradient_products(grid, cotangent, shape):
     def of_some(grid, cotangent):
         rows = _transposed(cotangent)
         columns = (shift.reshape(rows.shape[1], -1) for shift in _shifts(grid))
-        return jnp.stack([_matmul(rows, x) for x in columns])
+        return jnp.stack([matmul(rows, x) for x in columns])
 
     total = sum_chunks(of_some, _in_cache(grid), grid, cotangent)
     return total.swapaxes(-1, -2).reshape(shape)
@@ -99,18 +100,13 @@ def multiply(
     x: Float[Array, "*batch in"], matrix: Float[Array, "in out"]
 ) -> Float[Array, "*batch out"]:
     """The same product for every voxel, in the type of the grid."""
-    return _matmul(x, matrix).astype(x.dtype)
+    return matmul(x, matrix).astype(x.dtype)
 
 
 def _multiply_backward(saved, cotangent):
     x, matrix = saved
-    by_matrix = _matmul(_transposed(x), cotangent.reshape(-1, cotangent.shape[-1]))
+    by_matrix = matmul(_transposed(x), cotangent.reshape(-1, cotangent.shape[-1]))
     return multiply(cotangent, _transposed(matrix)), by_matrix.astype(matrix.dtype)
 
 
 multiply.defvjp(lambda x, matrix: (multiply(x, matrix), (x, matrix)), _multiply_backward)
-
-
-def _matmul(a, b):
-    """Products of bfloat16 gather in float32, which is also faster on CPU than in bfloat16."""
-    return jnp.matmul(a, b, preferred_element_type=jnp.float32)

@@ -32,7 +32,7 @@ from jaxshape.data.inputs import draw_pair
 from jaxshape.files import atomic_path, write_text
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
-from jaxshape.model.config import Completion, TrainConfig
+from jaxshape.model.config import TrainConfig
 from jaxshape.model.families import Batch, family_of
 from jaxshape.model.shapes import ShapeModel, ShapePrior, decode, encode
 from jaxshape.model.weights import fingerprint, flatten
@@ -355,8 +355,8 @@ def finished_prior(
     d = config.architecture.code
     params = jax.tree.map(jnp.asarray, family.params(averaged(state)))
     prior = ShapePrior(family.model, params, jnp.zeros(d), jnp.eye(d))
-    if isinstance(config.architecture, Completion):
-        return prior  # its codes are made to have mean 0 and covariance 1
+    if family.codes_are_normal:
+        return prior
     many = replace(config, batch=64, seed=config.seed + 1)
     encode_batch = jax.jit(lambda prior, batch: encode(prior, batch.grids))
     steps = -(-min(samples, len(dataset.names)) // many.batch)

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
 from jaxshape.data.sequences.frames import (
     Finding,
-    FrameFiles,
     SequenceError,
     usual_depth_scale,
 )
@@ -21,8 +20,8 @@ from jaxshape.data.sequences.listing import (
     color_images,
     depth_images,
     files_in,
+    frame_files,
     has_depth_folder,
-    mask_images,
     numbers_in,
     partners,
     with_colors_by_time,
@@ -61,9 +60,8 @@ def list_redwood(contents: Contents) -> Listed:
     order = np.argsort(color_times, kind="stable")
     paths = [list(offered.values())[i] for i in order]
     color, delays = with_colors_by_time(times, color_times[order], paths)
-    masks = partners(depth, mask_images(contents))
     return Listed(
-        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        files=frame_files(contents, depth, color),
         depth_scale=MILLIMETRES,
         read_pose=_trajectory_poses(contents, len(depth)),
         times=times,
@@ -110,10 +108,9 @@ def list_open3d(contents: Contents) -> Listed:
 def _by_name(contents: Contents) -> Listed:
     depth, offered = depth_images(contents), color_images(contents)
     color = partners(depth, offered)
-    masks = partners(depth, mask_images(contents))
     read = _pose_files(contents, list(depth)) or _trajectory_poses(contents, len(depth))
     return Listed(
-        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        files=frame_files(contents, depth, color),
         depth_scale=usual_depth_scale(depth.values()),
         read_pose=read,
         camera=DefaultCamera(PRIMESENSE, "Open3D's default, a PrimeSense", sure=False),

@@ -123,6 +123,31 @@ def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | 
     return [offered.get(name) or by_number.get(numbers_in(name)) for name in wanted]
 
 
+def last_number(name: str) -> int:
+    """The last number in a name; -1 where it has none."""
+    return (-1, *numbers_in(name))[-1]
+
+
+def frame_files(
+    contents: Contents,
+    depth: Mapping[str, Path],
+    color: Iterable[Path | None] | None = None,
+    confidence: Iterable[Path | None] | None = None,
+) -> tuple[FrameFiles, ...]:
+    """Files of the frame of each depth image.
+
+    Args:
+        contents: The folder.
+        depth: Depth images by name.
+        color: Colour image of each; None for those of the same names or numbers.
+        confidence: Confidence map of each; None for none.
+    """
+    color = partners(depth, color_images(contents)) if color is None else color
+    confidence = [None] * len(depth) if confidence is None else confidence
+    masks = partners(depth, mask_images(contents))
+    return tuple(map(FrameFiles, depth, depth.values(), color, masks, confidence))
+
+
 def nearest_in_time(
     wanted: Float[np.ndarray, " n"], offered: Float[np.ndarray, " m"]
 ) -> Int[np.ndarray, " n"]:

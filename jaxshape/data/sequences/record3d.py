@@ -9,16 +9,15 @@ from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
 from jaxshape.data.sequences.documents import matrix_of, read_json_object
-from jaxshape.data.sequences.frames import FrameFiles, SequenceError, usual_depth_scale
+from jaxshape.data.sequences.frames import SequenceError, usual_depth_scale
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
-    color_images,
     depth_images,
     files_in,
+    frame_files,
     has_depth_folder,
-    mask_images,
-    numbers_in,
+    last_number,
     partners,
 )
 from jaxshape.data.sequences.poses import from_opengl, from_quaternions, known
@@ -58,9 +57,8 @@ def list_frames(contents: Contents) -> Listed:
         raise SequenceError(f"{contents.folder} {_PACKED}")
     source = next(iter(_metadata(contents)), contents.folder / "metadata.json")
     about, depth = read_json_object(source), depth_images(contents)
-    color, masks = partners(depth, color_images(contents)), partners(depth, mask_images(contents))
     confidence = partners(depth, files_in(contents, ("confidence", "conf"), (".png",)))
-    numbers = [(-1, *numbers_in(name))[-1] for name in depth]
+    numbers = list(map(last_number, depth))
     poses = matrix_of(about.get("poses"), (-1, 7), source, "poses")
     T = from_opengl(from_quaternions(poses[:, 4:], poses[:, :4], source))
 
@@ -69,7 +67,7 @@ def list_frames(contents: Contents) -> Listed:
         return known(T[number], f"Pose {number} of {source}") if 0 <= number < len(T) else None
 
     return Listed(
-        files=tuple(map(FrameFiles, depth, depth.values(), color, masks, confidence)),
+        files=frame_files(contents, depth, confidence=confidence),
         depth_scale=usual_depth_scale(depth.values()),
         read_pose=read,
         calibration=_calibration(about, numbers, source),

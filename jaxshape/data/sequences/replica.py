@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
 from jaxshape.data.sequences.documents import matrix_of, read_bounded, read_json_object, rows_of
-from jaxshape.data.sequences.frames import FrameFiles, SequenceError
+from jaxshape.data.sequences.frames import SequenceError
 from jaxshape.data.sequences.listing import (
     COLOR_SUFFIXES,
     DEPTH_SUFFIXES,
@@ -16,8 +16,8 @@ from jaxshape.data.sequences.listing import (
     color_images,
     depth_images,
     files_in,
+    frame_files,
     has_depth_folder,
-    mask_images,
     partners,
 )
 from jaxshape.data.sequences.poses import known
@@ -57,7 +57,6 @@ def list_frames(contents: Contents) -> Listed:
         offered = {name: path for name, path in every.items() if not name.startswith("depth")}
     else:
         depth, offered = depth_images(contents), color_images(contents)
-    color, masks = partners(depth, offered), partners(depth, mask_images(contents))
     source = _poses(contents)
     if source is None:
         raise SequenceError(f"{contents.folder} holds no traj.txt; copy it there.")
@@ -68,7 +67,7 @@ def list_frames(contents: Contents) -> Listed:
         return known(poses[index], f"Line {index} of {source}") if index < len(poses) else None
 
     return Listed(
-        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        files=frame_files(contents, depth, partners(depth, offered)),
         depth_scale=scale,
         read_pose=read,
         calibration=calibration,

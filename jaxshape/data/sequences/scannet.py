@@ -1,15 +1,13 @@
 """ScanNet (Dai et al., CVPR 2017), as its SensReader exports scenes."""
 
 from jaxshape.data.sequences.cameras import Calibration
-from jaxshape.data.sequences.frames import FrameFiles
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
-    color_images,
     depth_images,
     files_in,
+    frame_files,
     has_depth_folder,
-    mask_images,
     partners,
 )
 from jaxshape.data.sequences.poses import read_matrix, read_pose
@@ -29,12 +27,10 @@ def list_frames(contents: Contents) -> Listed:
     """
     depth = depth_images(contents)
     poses = partners(depth, files_in(contents, ("pose", "poses"), (".txt",)))
-    color = partners(depth, color_images(contents))
-    masks = partners(depth, mask_images(contents))
     K = read_matrix(contents.folder / _CAMERA, 4)[:3, :3]
     K[:2, 2] += 0.5  # theirs count from the centre of the first pixel
     return Listed(
-        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        files=frame_files(contents, depth),
         depth_scale=1000.0,
         read_pose=(lambda index: read_pose(poses[index])) if any(poses) else None,
         calibration=Calibration(K[None], None, _CAMERA),

@@ -8,16 +8,16 @@ from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
 from jaxshape.data.sequences.documents import read_bounded, rows_of
-from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError, read_shape
+from jaxshape.data.sequences.frames import Finding, SequenceError, read_shape
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
     color_images,
     depth_images,
     files_in,
+    frame_files,
     has_depth_folder,
-    mask_images,
-    numbers_in,
+    last_number,
     partners,
 )
 from jaxshape.data.sequences.poses import from_quaternions, known
@@ -43,11 +43,11 @@ def list_frames(contents: Contents) -> Listed:
     source = contents.folder / "odometry.csv"
     columns = _read_columns(source)
     row_of = {int(number): row for row, number in enumerate(columns["frame"])}
-    rows = [row_of.get((-1, *numbers_in(name))[-1], -1) for name in depth]
+    rows = [row_of.get(last_number(name), -1) for name in depth]
     places = np.stack([columns[name] for name in "xyz"], axis=-1)
     turns = np.stack([columns[name] for name in ("qx", "qy", "qz", "qw")], axis=-1)
     T = from_quaternions(places, turns, source)
-    color, masks = partners(depth, color_images(contents)), partners(depth, mask_images(contents))
+    color = partners(depth, color_images(contents))
     confidence = partners(depth, files_in(contents, ("confidence",), (".png",)))
 
     def read(index: int) -> Float[np.ndarray, "4 4"] | None:
@@ -57,7 +57,7 @@ def list_frames(contents: Contents) -> Listed:
     times = columns["timestamp"][rows]
     rising = min(rows) >= 0 and bool((np.diff(times) > 0).all())
     return Listed(
-        files=tuple(map(FrameFiles, depth, depth.values(), color, masks, confidence)),
+        files=frame_files(contents, depth, color, confidence),
         depth_scale=1000.0,
         read_pose=read,
         times=times if rising else None,

@@ -4,16 +4,14 @@ import numpy as np
 
 from jaxshape.data.sequences.cameras import Calibration
 from jaxshape.data.sequences.documents import matrix_of, read_json_object, rows_of
-from jaxshape.data.sequences.frames import FrameFiles, SequenceError
+from jaxshape.data.sequences.frames import SequenceError
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
-    color_images,
     depth_images,
+    frame_files,
     has_depth_folder,
-    mask_images,
-    numbers_in,
-    partners,
+    last_number,
 )
 from jaxshape.data.sequences.poses import known
 
@@ -30,21 +28,20 @@ def list_frames(contents: Contents) -> Listed:
     Depth is in millimetres; poses are camera to world, of OpenCV's axes.
     """
     depth = depth_images(contents)
-    color, masks = partners(depth, color_images(contents)), partners(depth, mask_images(contents))
     source = contents.folder / _POSES
     poses = {int(row[0]): np.reshape(row[1:], (4, 4)) for row in rows_of(source, (17,))}
     if not poses:
         raise SequenceError(
             f"{source} holds no pose; expected a line for each image: copy it again."
         )
-    numbers = [(-1, *numbers_in(name))[-1] for name in depth]
+    numbers = list(map(last_number, depth))
 
     def read(index: int):
         T = poses.get(numbers[index])
         return None if T is None else known(T, f"Pose {numbers[index]} of {source}")
 
     return Listed(
-        files=tuple(map(FrameFiles, depth, depth.values(), color, masks)),
+        files=frame_files(contents, depth),
         depth_scale=1000.0,
         read_pose=read,
         calibration=_calibration(contents),

@@ -2,8 +2,17 @@
 
 import numpy as np
 
+from jaxshape.data.boxes import Box
 from jaxshape.mapping.map.recording import Progress
-from jaxshape.mapping.placement.faces import FACES, cutouts, faces_of, in_object, object_points
+from jaxshape.mapping.placement.faces import (
+    FACES,
+    Cutout,
+    cutouts,
+    faces_of,
+    in_object,
+    object_points,
+)
+from jaxshape.mapping.placement.finding import Start
 
 LEGS = 0.15
 """Share of the height of the box, from below, that legs take up at least."""
@@ -22,7 +31,8 @@ def doubts_of(progress: Progress) -> tuple[str, ...]:
     """
     if progress.start.T_level_world is None:
         return _empty(progress)
-    return (*_empty(progress), *_unseen(progress), *_legs(progress))
+    views = cutouts(progress.state.keyframes)
+    return (*_empty(progress), *_unseen(progress.start, views), *_legs(progress.start.box, views))
 
 
 def _empty(progress: Progress) -> tuple[str, ...]:
@@ -37,14 +47,13 @@ def _empty(progress: Progress) -> tuple[str, ...]:
     return (f"No pixel was taken for the object in {which}; nothing of that is fused.",)
 
 
-def _unseen(progress: Progress) -> tuple[str, ...]:
+def _unseen(start: Start, views: list[Cutout]) -> tuple[str, ...]:
     """The faces of the box whose place is a guess."""
-    box, views = progress.start.box, cutouts(progress.state.keyframes)
-    faces = faces_of(box, views)
+    faces = faces_of(start.box, views)
     if faces is None:
         return ()
     is_known = faces.seen.copy()
-    is_known[0, 1] |= np.isfinite(progress.start.floor)
+    is_known[0, 1] |= np.isfinite(start.floor)
     names = [FACES[axis][side] for axis in range(3) for side in (0, 1) if not is_known[side, axis]]
     if not names:
         return ()
@@ -58,10 +67,9 @@ def _joined(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _legs(progress: Progress) -> tuple[str, ...]:
+def _legs(box: Box, views: list[Cutout]) -> tuple[str, ...]:
     """Whether everything near the floor is predicted."""
-    box = progress.start.box
-    points = in_object(object_points(cutouts(progress.state.keyframes)), box)
+    points = in_object(object_points(views), box)
     if not len(points):
         return ()
     lowest = float(np.percentile(points[:, 1], _LOWEST)) + box.size[1] / 2
