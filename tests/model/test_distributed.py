@@ -74,7 +74,8 @@ def assert_same_weights(folder, whole_run, start):
     found, expected = (load_file(f / "checkpoint.safetensors") for f in (folder, whole_run.folder))
     assert found.keys() == expected.keys()
     for name, x in expected.items():
-        np.testing.assert_allclose(found[name], x, atol=1e-5, rtol=1e-5, err_msg=name)
+        # Muon orthogonalises gradients, which magnifies the rounding of sums in another order.
+        np.testing.assert_allclose(found[name], x, atol=5e-5, rtol=1e-5, err_msg=name)
     name = "params/decoder/conv1"
     moved = expected[f"variables/{name}"] - load_file(start)[name]
     assert np.abs(moved).max() > 2e-3  # there was something to get wrong
