@@ -1,3 +1,6 @@
+from .bench.ask_tell import AskTell
+from .bench.own_loop import Watch, enter_benchmark
+from .bench.problems import Problem, problems
 from .data.archives import MeshSource
 from .data.boxes import Box
 from .data.capture import (
@@ -85,6 +88,7 @@ from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",
+    "AskTell",
     "BALANCED",
     "Bounds",
     "Box",
@@ -110,6 +114,7 @@ __all__ = [
     "PlacementConfig",
     "Prepared",
     "PreparedFrame",
+    "Problem",
     "Progress",
     "Prompt",
     "Reconstruction",
@@ -133,6 +138,7 @@ __all__ = [
     "TrackingConfig",
     "Trajectory",
     "VirtualCamera",
+    "Watch",
     "Weights",
     "binary",
     "bounds",
@@ -151,6 +157,7 @@ __all__ = [
     "decode",
     "decode_prepared",
     "encode",
+    "enter_benchmark",
     "equation_7",
     "evosax_strategy",
     "f_score",
@@ -178,6 +185,7 @@ __all__ = [
     "orbit",
     "place",
     "polished",
+    "problems",
     "random_chair",
     "random_views",
     "raw",

@@ -16,7 +16,7 @@ ROOT = Path(jaxshape.__file__).parent
 BELOW_ALL = ("checks", "files", "process")
 """Modules that import nothing of jaxshape."""
 
-PACKAGES = ("geometry", "data", "model", "search", "mapping", "results", "report", "cli")
+PACKAGES = ("geometry", "data", "model", "search", "mapping", "results", "report", "bench", "cli")
 ROOMS = ("config", "segmentation", "tracking", "placement", "map")
 """Each imports from itself and from those before it."""
 

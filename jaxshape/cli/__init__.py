@@ -11,6 +11,7 @@ leaves earlier output as it was. JAX, and all that needs it, is imported inside 
     inspecting inspect
     learning   dataset, train
     scoring    evaluate, plot
+    benchmarking  bench
     viewing    view
 """
 
@@ -23,6 +24,7 @@ import tyro
 from rich.markup import escape
 from tyro.conf import subcommand
 
+from jaxshape.cli.benchmarking import Bench
 from jaxshape.cli.common import console
 from jaxshape.cli.completing import Complete
 from jaxshape.cli.inspecting import Inspect
@@ -51,6 +53,7 @@ def commands(arguments: Sequence[str]) -> Any:
         | Annotated[Inspect, subcommand("inspect")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]
+        | Annotated[Bench, subcommand("bench")]
         | Annotated[ViewResult, subcommand("view")]
     )
 

@@ -52,6 +52,7 @@ NOT_RUN = {
     "make test-slow": "runs this",
     "git clone <this repository> && cd jaxshape": "fetches",
     "jaxshape view out/reconstruct": "serves until it is stopped; tests/report/test_viewer.py",
+    "jaxshape bench --methods cma,gradient:adam,mine:build --output board": "tests/bench runs it",
     "python experiments/mugs.py --output data/mugs": "tests/experiments/test_mugs.py runs it",
 }
 """Commands, by the reason."""
