@@ -18,6 +18,7 @@ from jaxshape.bench.entries import file_name, new_entry, read_entry, with_rows, 
 from jaxshape.bench.problems import Problem, objectives, stacked_targets
 from jaxshape.bench.scoring import Row, rows_of
 from jaxshape.bench.watching import Observer, WatchedObjective, watched
+from jaxshape.search.residuals import Target
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,16 @@ class Watch:
             checks.refuse("problems", self.problems, "one problem or more")
         checks.whole("budget", self.budget, LADDER[1])
         checks.within("budget", self.budget, LADDER[1], LADDER[-1])
+        self.begin()
+        _ = self._watched  # its arrays are made now, before anything is traced
 
     @cached_property
     def _observer(self) -> Observer:
-        observer = Observer(self.budget)
-        observer.begin(*self._first)
-        return observer
+        return Observer(self.budget)
+
+    @cached_property
+    def _targets(self) -> Target:
+        return stacked_targets(self.problems)
 
     @cached_property
     def _first(self) -> tuple[Float[Array, "problem d"], Float[np.ndarray, " problem"]]:
@@ -55,8 +60,7 @@ class Watch:
 
     @cached_property
     def _watched(self) -> WatchedObjective:
-        each = objectives(self.problems[0].decoder, stacked_targets(self.problems))
-        return watched(each, self._observer)
+        return watched(objectives(self.problems[0].decoder, self._targets), self._observer)
 
     def objective(
         self, code: Float[Array, " d"], number: Int[Array, ""] | int = 0
