@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
+from jaxshape.claim import Output
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Seen, checked_numbers
 from jaxshape.files import write_json
@@ -46,6 +47,11 @@ class Evaluate:
     seed: int = 0
     """Seed of noise, surface samples and searches, 0 or more."""
 
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output, is_file=True, goes_on=True)
+
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
         from jaxshape.data.dataset import TEST_SEEDS
@@ -61,7 +67,7 @@ class Evaluate:
             seed=self.seed,
         )
         require(
-            (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
+            (self.meshes is None) != (self.chairs == 0) and 0 <= self.chairs <= TEST_SEEDS,
             "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",
         )
         test_seeds = range(TEST_SEEDS, TEST_SEEDS + self.chairs)
@@ -190,6 +196,11 @@ class Plot:
     """Folders made by `jaxshape reconstruct` or `jaxshape demo`; several are compared."""
     output: Path | None = None
     """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder by default."""
+
+    @property
+    def writes(self) -> Output | None:
+        """What is written; None where that is in the folder of a result, which has to be there."""
+        return None if self.output is None else Output(self.output, is_file=True)
 
     def run(self) -> None:
         from jaxshape.report.plots import compare_searches, plot_search
