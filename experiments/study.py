@@ -230,7 +230,7 @@ def _rounded(value: Any) -> Any:
 
 
 class Claim(NamedTuple):
-    """What the paper says, and what was found here: a row of the README's table."""
+    """What the paper says, and what was found here: a row of the table in docs/paper.md."""
 
     figure: str
     """Of the paper, or `beyond`."""
@@ -242,7 +242,7 @@ class Claim(NamedTuple):
 
 
 def conclude(journal: Journal, claims: Iterable[Claim], **findings: Any) -> None:
-    """Write what the rows say into the results file: the claims for the README, and more."""
+    """Write what the rows say into the results file: the claims for docs/paper.md, and more."""
     journal.write({"claims": [claim._asdict() for claim in claims]} | findings)
 
 
