@@ -47,10 +47,8 @@ def make_seat(kind: str, seed: int) -> trimesh.Trimesh:
     whole = made.evaluated_get(graph)
     mesh = whole.to_mesh()
     mesh.calc_loop_triangles()
-    vertices, faces = (
-        np.empty((len(mesh.vertices), 3)),
-        np.empty((len(mesh.loop_triangles), 3), int),
-    )
+    vertices = np.empty((len(mesh.vertices), 3))
+    faces = np.empty((len(mesh.loop_triangles), 3), int)
     mesh.vertices.foreach_get("co", vertices.ravel())
     mesh.loop_triangles.foreach_get("vertices", faces.ravel())
     placed = trimesh.Trimesh(vertices, faces, process=False).apply_transform(made.matrix_world)
