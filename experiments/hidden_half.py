@@ -1,6 +1,6 @@
 r"""What fills the hidden half of a chair best: four networks, small, at equal budget.
 
-    jaxshape dataset --output data/chairs --chairs 4096
+    jaxshape dataset --output data/chairs --count 4096
     python experiments/hidden_half.py --dataset data/chairs --meshes cad_chairs/
 
 Each network is trained from scratch on the same pairs, the same number of them:

@@ -41,7 +41,7 @@ MORE = {
     "plot": "",
     "complete": "--iterations 2 --weights known.safetensors",
     "evaluate": "--frames 1 --iterations 2 --weights known.safetensors",
-    "dataset": "--chairs 12 --frames 1 2 --cameras paper --workers 1",
+    "dataset": "--count 12 --frames 1 2 --cameras paper --workers 1",
     "train": "--steps 2 --batch 2 --code 10",
 }
 """Options that a command gets besides its own; of two that differ, the last counts."""
