@@ -7,7 +7,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxshape.cli.common import console, require
+from jaxshape import checks, limits
+from jaxshape.claim import Output
+from jaxshape.cli.common import console
 from jaxshape.cli.options import Seen
 from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.config import FamilyName
@@ -40,6 +42,9 @@ class Rebuild:
     """Weights to use instead of those that come with the package."""
     seed: int = 0
     """Seed of all random numbers, 0 or more."""
+
+    def __post_init__(self) -> None:
+        checks.seed("seed", self.seed)
 
     def prepare(self) -> tuple[Any, Any, RefineConfig]:
         """The prior, the search and its settings, so that bad options are refused before work."""
@@ -129,19 +134,26 @@ class Demo(Rebuild):
     family: FamilyName = "chair"
     """Class of the object, and of the weights where none are given."""
     frames: int = 6
-    """Depth frames along the orbit, 20 degrees apart, 1 or more."""
+    """Depth frames along the orbit, 20 degrees apart, 1 to 180: ten times around."""
     seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     output: Path = Path("out/demo")
     """Folder for mesh.glb, mesh.ply, grid.npz, trace.npz, result.json, overview.png and
     report.html."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.whole("frames", self.frames, 1, limits.FRAMES, "that is ten times around")
+
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output)
 
     def run(self) -> None:
         start = time.perf_counter()
         from jaxshape.data.families import TEST_SEEDS, Procedural
         from jaxshape.search.reconstruction import require_measured
 
-        require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
-        require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
         seen = self.seen.config()
         prior, refiner, config = self.prepare()
         with console.status(f"filming a {self.family}"):

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
+from jaxshape.claim import Output
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Seen, checked_numbers
 from jaxshape.data.config import FamilyName
@@ -49,6 +50,11 @@ class Evaluate:
     seed: int = 0
     """Seed of noise, surface samples and searches, 0 or more."""
 
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output, is_file=True, goes_on=True)
+
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
         from jaxshape.data.families import TEST_SEEDS, procedural_objects
@@ -64,7 +70,7 @@ class Evaluate:
             seed=self.seed,
         )
         require(
-            (self.meshes is None) != (self.count == 0) and self.count >= 0,
+            (self.meshes is None) != (self.count == 0) and 0 <= self.count <= TEST_SEEDS,
             "Give either --meshes PATH or --count NUMBER, to say what to evaluate on.",
         )
         procedural = procedural_objects(self.family, self.count, TEST_SEEDS)
@@ -194,6 +200,11 @@ class Plot:
     """Folders made by `jaxshape reconstruct` or `jaxshape demo`; several are compared."""
     output: Path | None = None
     """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder by default."""
+
+    @property
+    def writes(self) -> Output | None:
+        """What is written; None where that is in the folder of a result, which has to be there."""
+        return None if self.output is None else Output(self.output, is_file=True)
 
     def run(self) -> None:
         from jaxshape.report.plots import compare_searches, plot_search

@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from jaxshape import limits, reading
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.autoencoder import AUTOENCODER
@@ -111,7 +112,12 @@ def load_prior(
     found = _model(metadata.get("kind", AUTOENCODER.kind), model, where)
     mean, covariance = tensors.pop("code_mean", None), tensors.pop("code_covariance", None)
     # Converted by NumPy: JAX would compile a program for each shape.
-    params = unflatten({name: jnp.asarray(x) for name, x in _weights(tensors, where).items()})
+    with np.errstate(over="ignore"):  # what is too large is found to be infinite below
+        named = {name: jnp.asarray(x) for name, x in _weights(tensors, where).items()}
+    try:
+        params = unflatten(named)
+    except (TypeError, ValueError) as problem:
+        raise WeightsError(f"{str(where)!r} holds no weights: {problem}.") from None
     _check(found, params, mean, covariance, where)
     return ShapePrior(found, params, jnp.asarray(mean), jnp.asarray(covariance))
 
@@ -147,7 +153,13 @@ def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
     Args:
         path: A weights file, or a name of the package's weights; None for "chair".
     """
-    return json.loads(_read(_path(path))[1]["card"])
+    where = _path(path)
+    try:
+        return reading.parse_json(_read(where)[1].get("card", "{}"))
+    except WeightsError:
+        raise
+    except ValueError as problem:
+        raise WeightsError(f"{str(where)!r} holds a damaged card: {problem}.") from None
 
 
 def fingerprint(prior: ShapePrior) -> str:
@@ -173,6 +185,10 @@ def unflatten(named: dict[str, Any]) -> PyTree:
         branch = tree
         for parent in parents:
             branch = branch.setdefault(parent, {})
+            if not isinstance(branch, dict):
+                raise ValueError(f"{parent!r} is an array and holds {name!r}")
+        if leaf in branch:
+            raise ValueError(f"{name!r} is an array and holds others")
         branch[leaf] = x
     return tree
 
@@ -188,10 +204,14 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     if not path.exists():
         raise WeightsError(f"There is no weights file {str(path)!r}; make one: jaxshape train.")
     try:
-        with safe_open(path, "np") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as problem:
+        with reading.opened(path, limits.WEIGHT_BYTES), safe_open(path, "np") as file:
+            metadata, names = file.metadata() or {}, list(file.keys())
+            if len(names) > limits.ARRAY_ENTRIES:
+                raise ValueError(f"it holds {len(names)} arrays")
+            if any(name.count("/") > limits.WEIGHT_NESTING for name in names):
+                raise ValueError(f"its names are nested more than {limits.WEIGHT_NESTING} deep")
+            tensors = {name: file.get_tensor(name) for name in names}
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as problem:
         raise WeightsError(
             f"{str(path)!r} is not a readable safetensors file: {problem}."
         ) from None
