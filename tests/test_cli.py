@@ -37,7 +37,8 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import families
 
 COMMANDS = (
-    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view"
+    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view",
+    "doctor",
 )  # fmt: skip
 
 
