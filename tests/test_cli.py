@@ -37,7 +37,8 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import families
 
 COMMANDS = (
-    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view"
+    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view",
+    "doctor",
 )  # fmt: skip
 
 
@@ -355,7 +356,7 @@ def test_a_collection_of_meshes_that_cannot_be_trained_on_is_refused(chair, refu
 
 def test_a_missing_dataset_is_refused(refused, tmp_path):
     assert "There is no dataset" in refused("train", "--dataset", tmp_path / "nowhere")
-    assert "--chairs is 0" in refused("dataset", "--chairs", 0)
+    assert "--count is 0" in refused("dataset", "--count", 0)
     assert "--paths is 0" in refused("dataset", "--paths", 0)
     assert "--missing is -0.1" in refused("dataset", "--missing", -0.1)
     assert "--noisy is 1.5" in refused("dataset", "--noisy", 1.5)
@@ -724,7 +725,7 @@ def test_training_goes_on_from_the_weights_of_another(
 @pytest.mark.slow
 def test_from_dataset_to_training_to_reconstruction(run, chair, tmp_path):
     data, trained = tmp_path / "data", tmp_path / "train"
-    make = ("dataset", "--chairs", 4, "--frames", 1, 2, "--cameras", "paper", "--workers", 1,
+    make = ("dataset", "--count", 4, "--frames", 1, 2, "--cameras", "paper", "--workers", 1,
             "--output", data)  # fmt: skip
     learn = ("train", "--dataset", data, "--output", trained, "--steps", 2, "--batch", 2)
     few = ("--weights", trained / "weights.safetensors", "--iterations", 2)

@@ -25,7 +25,7 @@ WRONG = {
                     "noisy": SHARE, "arcs": SHARE, "up": ("w", "+x"), "front": ("",),
                     "resolution": (0, 33, 24), "seed": (-1, 2**32)},
     Architecture: {"encoder": ((), (4, 0, 8), (10**9,)), "decoder": ((0,),),
-                   "code": (*COUNT, 1, 10**9)},
+                   "code": (*COUNT, 1, 10**9), "occlusion": SWITCH},
     Completion: {"channels": ((4, 0, 8), (10**9, 1, 1)), "depth": (*COUNT, 10**9),
                  "code": (*COUNT, 1), "resolution": (0, 12, 4, 8 * 10**9)},
     TrainConfig: {"steps": (*COUNT, 10**9), "batch": (*COUNT, 10**9), "optimizer": ("sgd",),

@@ -12,6 +12,7 @@ leaves earlier output as it was. JAX, and all that needs it, is imported inside 
     learning   dataset, train
     scoring    evaluate, plot
     viewing    view
+    doctor     doctor
 """
 
 import io
@@ -20,6 +21,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
@@ -29,6 +31,7 @@ from tyro.conf import subcommand
 from jaxshape.claim import Output, claimed
 from jaxshape.cli.common import console, warn
 from jaxshape.cli.completing import Complete
+from jaxshape.cli.doctor import Doctor
 from jaxshape.cli.inspecting import Inspect
 from jaxshape.cli.learning import BuildDataset, Train, preset_in
 from jaxshape.cli.options import RefusedSetting, refusing, reworded
@@ -57,6 +60,7 @@ def commands(arguments: Sequence[str]) -> Any:
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]
         | Annotated[ViewResult, subcommand("view")]
+        | Annotated[Doctor, subcommand("doctor")]
     )
 
 
@@ -67,6 +71,9 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):  # names of files may be in no encoding
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    if sys.argv[1:] == ["--version"]:
+        print(f"jaxshape {version('jaxshape')}")
+        return
     table, output = commands(sys.argv[1:]), None
     try:
         command = tyro.cli(table, prog="jaxshape", registry=refusing())

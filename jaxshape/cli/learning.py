@@ -17,7 +17,7 @@ from jaxshape.claim import Output
 from jaxshape.cli.common import console, progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Machines
 from jaxshape.cli.scoring import load_models, score
-from jaxshape.data.config import DatasetConfig
+from jaxshape.data.config import DatasetConfig, FamilyName
 from jaxshape.files import write_json, write_text
 from jaxshape.model.config import TrainConfig
 from jaxshape.process import spread_over_cores
@@ -38,18 +38,22 @@ class BuildDataset:
 
     Examples: jaxshape dataset --output data/chairs
 
+    jaxshape dataset --family table --count 2000
+
     jaxshape dataset --output data/mugs --meshes mugs/ --up z --front -y
 
     jaxshape dataset --output data/paper --preset paper
     """
 
     output: Path | None = None
-    """Folder of the dataset; data/chairs, or data/NAME of --meshes NAME, where not given. A build
-    that was killed goes on when asked for again."""
-    chairs: int = 8000
-    """Procedural chairs to make, unless --meshes is given."""
+    """Folder of the dataset; data/chairs or data/tables, or data/NAME of --meshes NAME, where not
+    given. A build that was killed goes on when asked for again."""
+    family: FamilyName = "chair"
+    """Procedural objects to make, unless --meshes is given."""
+    count: int = 8000
+    """How many of them."""
     meshes: Path | None = None
-    """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural chairs."""
+    """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural objects."""
     preset: Preset = "default"
     """Defaults of the options below: the best that we found, or the paper's 18 clean single views,
     which `jaxshape dataset --preset paper --help` shows."""
@@ -63,7 +67,8 @@ class BuildDataset:
     @property
     def folder(self) -> Path:
         """Folder of the dataset."""
-        return self.output or Path("data") / (self.meshes.stem if self.meshes else "chairs")
+        name = self.meshes.stem if self.meshes else f"{self.family}s"
+        return self.output or Path("data") / name
 
     @property
     def writes(self) -> Output:
@@ -72,10 +77,12 @@ class BuildDataset:
 
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
-        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.families import TEST_SEEDS, procedural_objects
 
-        require(1 <= self.chairs <= TEST_SEEDS, f"--chairs is {self.chairs}; give 1 to 1000000.")
-        objects: Sequence[Any] = list_meshes(self.meshes) if self.meshes else range(self.chairs)
+        require(1 <= self.count <= TEST_SEEDS, f"--count is {self.count}; give 1 to 1000000.")
+        objects: Sequence[Any] = (
+            list_meshes(self.meshes) if self.meshes else procedural_objects(self.family, self.count)
+        )
         build(self.folder, objects, self.config, self.workers)
 
 

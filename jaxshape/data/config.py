@@ -12,6 +12,9 @@ from jaxshape import checks, limits
 CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]
 """Depth cameras that a virtual one can stand for (`data/virtual_cameras`)."""
 
+FamilyName = Literal["chair", "table"]
+"""Families of procedural objects (`data/families`), and weights of the same names."""
+
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 

@@ -27,6 +27,8 @@ class Architecture:
         decoder: Channels after each transposed convolution but the last, which has one channel: one
             entry fewer than `encoder`, each 1 or more.
         code: Numbers in a code, 2 or more (paper: 100).
+        occlusion: Give the encoder the occlusion mask M beside F, both soft. The paper's encoder
+            sees F alone, binary, and cannot tell free voxels from unknown ones.
 
     Raises:
         ValueError: The layers of encoder and decoder do not match, or a size is outside its range.
@@ -35,8 +37,10 @@ class Architecture:
     encoder: tuple[int, ...] = (32, 64, 128, 256)
     decoder: tuple[int, ...] = (128, 64, 32)
     code: int = 100
+    occlusion: bool = False
 
     def __post_init__(self) -> None:
+        checks.one_of("occlusion", self.occlusion, (True, False))
         for name in ("encoder", "decoder"):
             _check_channels(name, getattr(self, name))
         checks.whole("code", self.code, 2, limits.CODE, "its covariance has the square")
