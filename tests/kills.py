@@ -36,10 +36,10 @@ TIMES = ("seconds", "training_seconds", "samples_per_second", "command", "source
 def commands(at: Path) -> dict[str, tuple[list[str], str]]:
     """The commands by name, and the option that names their output."""
     known, frames = str(at / "known.safetensors"), at / "frames"
-    made = "dataset --chairs 130 --frames 1 --cameras paper --resolution 8 --workers 1".split()
+    made = "dataset --count 130 --frames 1 --cameras paper --resolution 8 --workers 1".split()
     data = str(at / "whole" / "dataset")
     trained = ["train", "--dataset", data, "--steps", "60", "--report-every", "5", "--batch", "2"]
-    scored = "evaluate --chairs 24 --frames 1,2 --methods encoder,cma --iterations 3".split()
+    scored = "evaluate --count 24 --frames 1,2 --methods encoder,cma --iterations 3".split()
     found = "--iterations 3 --keyframe-iterations 2 --min-hits 1".split()
     box = ["--box", str(frames / "box.json"), "--poses", "first"]
     return {

@@ -22,7 +22,7 @@ COMMANDS = {
     "complete": (completing.Complete, ("scan.ply",)),
     "dataset": (learning.BuildDataset, ()),
     "train": (learning.Train, ("--dataset", "data")),
-    "evaluate": (scoring.Evaluate, ("--chairs", "1")),
+    "evaluate": (scoring.Evaluate, ("--count", "1")),
     "plot": (scoring.Plot, ("out",)),
 }
 FILES = ("evaluate", "plot")
