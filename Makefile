@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo paper test test-slow lint clean
+.PHONY: install demo docs paper test test-slow wheel lint clean
 
 install: $(VENV)/.runtime
 
@@ -49,6 +49,20 @@ test: $(VENV)/.develop
 
 test-slow: $(VENV)/.develop
 	$(BIN)/python -m pytest -m slow
+
+# Into out/site; a warning is an error.
+docs: $(VENV)/.runtime
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
+# Built, installed into a fresh environment, and tried from an empty folder.
+wheel: $(VENV)/.runtime
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
+	rm -rf out/wheel && $(BIN)/python -m build --quiet --wheel --outdir out/wheel
+	find out/wheel -name '*.whl' -size -20000k | grep .
+	$(PYTHON) -m venv out/wheel/venv
+	out/wheel/venv/bin/python -m pip install --quiet --disable-pip-version-check out/wheel/*.whl
+	mkdir out/wheel/empty && cd out/wheel/empty && ../venv/bin/jaxshape doctor && ../venv/bin/jaxshape demo
 
 lint: $(VENV)/.develop
 	$(BIN)/ruff check .
