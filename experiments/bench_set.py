@@ -27,7 +27,8 @@ from jaxshape.bench.config import FRAMES
 from jaxshape.bench.problem_set import NAME, ProblemSet, fingerprint, write_set
 from jaxshape.bench.problems import EQUATION_7, WEIGHTS, Problem, problems
 from jaxshape.data.archives import list_meshes
-from jaxshape.data.dataset import TEST_SEEDS, Object, load_object, pack, pack_measured
+from jaxshape.data.dataset import Object, load_object, pack, pack_measured
+from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.data.meshes import Skipped
 from jaxshape.model import weights
 from jaxshape.model.weights import load_prior
@@ -41,7 +42,6 @@ KINDS = {
     "clean": EvaluateConfig(camera="paper", frames=FRAMES),
     "noisy": EvaluateConfig(camera="kinect", frames=FRAMES),
 }
-CHAIRS = 16
 SEATS = (
     "blendswap_cc_0_armchair_armchair",
     "blendswap_cc_0_oakchair_oakchair",
@@ -86,8 +86,8 @@ def items(meshes: Path) -> list[tuple[Object, dict[str, str]]]:
     listed = {seat.name: seat for seat in read_list()}
     found = []
     for i, name in enumerate(SEATS):
-        for seed in (TEST_SEEDS + 2 * i, TEST_SEEDS + 2 * i + 1):
-            found.append((seed, {"name": f"chair-{seed}", "source": "procedural"}))
+        for chair in procedural_objects("chair", 2, TEST_SEEDS + 2 * i):
+            found.append((chair, {"name": chair.name, "source": "procedural"}))
         seat = listed[name]
         assert seat.licence == "CC0"
         about = {"title": seat.title, "creator": seat.creator, "licence": seat.licence}

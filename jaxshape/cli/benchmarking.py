@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from jaxshape.bench.config import FRAMES, KINDS, BenchConfig, KindName
+from jaxshape.claim import Output
 from jaxshape.cli.common import console, progress_bar, require
 from jaxshape.cli.options import checked_numbers
 
@@ -43,6 +44,15 @@ class Bench:
     search: tyro.conf.OmitArgPrefixes[BenchConfig] = BenchConfig()
     check: bool = False
     """Run nothing; say what is wrong with the results in the folder, computing objectives anew."""
+
+    @property
+    def writes(self) -> Output | None:
+        """What is written; the parts of a board may be made at the same time."""
+        if self.check:
+            return None
+        i, n = _part(self.part)
+        part = self.output / f"part-{i}-of-{n}"
+        return Output(part if n > 1 else self.output, is_file=n > 1, goes_on=True)
 
     def run(self) -> None:
         from jaxshape.bench.entries import read_entries

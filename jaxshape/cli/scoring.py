@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
+from jaxshape.claim import Output
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Seen, checked_numbers
+from jaxshape.data.config import FamilyName
 from jaxshape.files import write_json
 from jaxshape.search.config import RefineConfig
 
@@ -31,8 +33,10 @@ class Evaluate:
     meshes: Path | None = None
     """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
-    chairs: int = 0
-    """Number of procedural test chairs to use instead of --meshes."""
+    family: FamilyName = "chair"
+    """Class of the procedural objects, and of the weights where none are given."""
+    count: int = 0
+    """Number of procedural test objects to use instead of --meshes."""
     frames: str = "1,4,8,18"
     """Numbers of frames to fuse, separated by commas: the first k of an orbit, 20 degrees apart."""
     methods: str = "encoder,gradient,cma"
@@ -46,9 +50,14 @@ class Evaluate:
     seed: int = 0
     """Seed of noise, surface samples and searches, 0 or more."""
 
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output, is_file=True, goes_on=True)
+
     def run(self) -> None:
         from jaxshape.data.archives import list_meshes
-        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.families import TEST_SEEDS, procedural_objects
         from jaxshape.model.weights import load_prior
         from jaxshape.results import evaluation
 
@@ -61,19 +70,20 @@ class Evaluate:
             seed=self.seed,
         )
         require(
-            (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
-            "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",
+            (self.meshes is None) != (self.count == 0) and 0 <= self.count <= TEST_SEEDS,
+            "Give either --meshes PATH or --count NUMBER, to say what to evaluate on.",
         )
-        test_seeds = range(TEST_SEEDS, TEST_SEEDS + self.chairs)
-        sources = list_meshes(self.meshes) if self.meshes else test_seeds
-        prior = load_prior(self.weights)
+        procedural = procedural_objects(self.family, self.count, TEST_SEEDS)
+        sources = list_meshes(self.meshes) if self.meshes else procedural
+        prior = load_prior(self.weights or self.family)
         evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
         models, skipped = load_models(sources, self.axes)
-        _check_upright(models, refuse=self.weights is None)
+        if self.family == "chair":
+            _check_upright(models, refuse=self.weights is None)
         about = {
-            "meshes": str(self.meshes) if self.meshes else f"{self.chairs} procedural chairs",
+            "meshes": str(self.meshes or f"{self.count} procedural {self.family}s"),
             **asdict(self.axes),
-            "weights": str(self.weights) if self.weights else "chair (packaged)",
+            "weights": str(self.weights) if self.weights else f"{self.family} (packaged)",
         }
         score(self.output, prior, config, about, models, skipped)
 
@@ -190,6 +200,11 @@ class Plot:
     """Folders made by `jaxshape reconstruct` or `jaxshape demo`; several are compared."""
     output: Path | None = None
     """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder by default."""
+
+    @property
+    def writes(self) -> Output | None:
+        """What is written; None where that is in the folder of a result, which has to be there."""
+        return None if self.output is None else Output(self.output, is_file=True)
 
     def run(self) -> None:
         from jaxshape.report.plots import compare_searches, plot_search

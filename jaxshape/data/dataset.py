@@ -26,8 +26,8 @@ from jaxtyping import Bool, UInt8
 
 from jaxshape.data import meshes
 from jaxshape.data.archives import MeshSource
-from jaxshape.data.chairs import random_chair
 from jaxshape.data.config import DatasetConfig
+from jaxshape.data.families import Procedural
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.data.paths import draw_path
 from jaxshape.files import atomic_path, write_json
@@ -43,11 +43,8 @@ OBJECTS_PER_SHARD = 64
 STEPS = 15
 """Steps of the probabilities of what was measured, which have 4 bits each."""
 
-TEST_SEEDS = 1_000_000
-"""Procedural chairs from this seed on are for tests; training uses smaller ones."""
-
-Object = int | MeshSource
-"""An object of a dataset: the seed of a procedural chair, or a mesh file."""
+Object = Procedural | MeshSource
+"""An object of a dataset: a procedural one, or a mesh file."""
 
 
 class DatasetError(ValueError):
@@ -75,7 +72,7 @@ def load_object(item: Object, *, up: str = "y", front: str = "z") -> Model | Ski
     """Make or read one object in the canonical frame."""
     if isinstance(item, MeshSource):
         return meshes.load(item, up=up, front=front)
-    return Model(f"chair-{item}", random_chair(item), {})
+    return Model(item.name, item.make(), {})
 
 
 def object_paths(
@@ -135,7 +132,7 @@ def build_dataset(
 
     Args:
         folder: Folder of the dataset; made if missing.
-        objects: Seeds of procedural chairs, or meshes.
+        objects: Procedural objects, or meshes.
         config: Settings of the dataset.
         workers: Processes, 1 or more; None for one for each CPU core.
 
@@ -194,7 +191,7 @@ def hash_seed(*numbers: int) -> int:
 
 
 def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> None:
-    names = [item.name if isinstance(item, MeshSource) else str(item) for item in objects]
+    names = [item.name for item in objects]
     digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     settings = json.loads(json.dumps(asdict(config)))
     claim = {"format": FORMAT, "config": settings, "objects": len(names), "names_sha256": digest}

@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from jaxshape import limits
 from jaxshape.data.archives import Beside, MeshSource, TooLarge, list_meshes, read_bytes
 from jaxshape.data.config import check_axes
 from jaxshape.data.orientation import apparent_up
@@ -25,7 +26,7 @@ __all__ = [
     "lying_on_its_side", "read_meshes", "sample_oriented", "sample_surface",
 ]  # fmt: skip
 
-MAX_FACES = 20_000_000
+MAX_FACES = limits.MESH_FACES
 """Most triangles of one mesh, counted over all its instances in a scene."""
 
 FLAT = 1e-6
