@@ -45,8 +45,8 @@ def test_adam_walks_as_it_does_in_refine(two, linear_prior):
 
 
 def test_a_population_does_not_depend_on_its_company(two):
-    together, _ = searched("cma", two)
-    alone, _ = searched("cma", two[1:])
+    together, _ = searched("evosax:SNES", two)
+    alone, _ = searched("evosax:SNES", two[1:])
     one, other = together[two[1].name], alone[two[1].name]
     assert one["calls"] == other["calls"] == 64
     np.testing.assert_allclose(one["objective"], other["objective"], rtol=1e-5)
