@@ -1,3 +1,6 @@
+from .bench.ask_tell import AskTell
+from .bench.own_loop import Watch, enter_benchmark
+from .bench.problems import Problem, problems
 from .data.archives import MeshSource
 from .data.boxes import Box
 from .data.capture import (
@@ -86,6 +89,7 @@ from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",
+    "AskTell",
     "BALANCED",
     "Bounds",
     "Box",
@@ -111,6 +115,7 @@ __all__ = [
     "PlacementConfig",
     "Prepared",
     "PreparedFrame",
+    "Problem",
     "Progress",
     "Prompt",
     "Reconstruction",
@@ -134,6 +139,7 @@ __all__ = [
     "TrackingConfig",
     "Trajectory",
     "VirtualCamera",
+    "Watch",
     "Weights",
     "binary",
     "bounds",
@@ -152,6 +158,7 @@ __all__ = [
     "decode",
     "decode_prepared",
     "encode",
+    "enter_benchmark",
     "equation_7",
     "evosax_strategy",
     "f_score",
@@ -179,6 +186,7 @@ __all__ = [
     "orbit",
     "place",
     "polished",
+    "problems",
     "random_chair",
     "random_table",
     "random_views",

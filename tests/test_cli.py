@@ -38,7 +38,7 @@ from jaxshape.search.names import families
 
 COMMANDS = (
     "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view",
-    "doctor",
+    "doctor", "bench",
 )  # fmt: skip
 
 

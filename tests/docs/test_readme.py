@@ -50,10 +50,15 @@ NOT_RUN = {
     "make demo": "installs; the test of `jaxshape demo` runs what it runs",
     "make test": "runs this",
     "make lint": "runs other programs",
+    "make fuzz": "takes twenty minutes",
+    "make kills": "takes an hour",
+    "cd docs/examples && jaxshape bench --methods own_search:build --objects 8 --frames 4 --output "
+    "~/board": "tests/docs/test_examples.py runs it",
     "make test-slow": "runs this",
     "git clone <this repository> && cd jaxshape": "fetches",
     "pip install jaxshape": "installs",
     "jaxshape view out/reconstruct": "serves until it is stopped; tests/report/test_viewer.py",
+    "jaxshape bench --methods cma,gradient:adam,mine:build --output board": "tests/bench runs it",
     "python experiments/mugs.py --output data/mugs": "tests/experiments/test_mugs.py runs it",
 }
 """Commands, by the reason."""
