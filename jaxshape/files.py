@@ -22,6 +22,7 @@ _REASONS = {
     errno.EPERM: "permission to write there is missing",
     errno.ENOENT: "it was removed meanwhile",
     errno.ENOTDIR: "a part of the path is a file",
+    errno.EEXIST: "a part of the path is a file",
 }
 
 

@@ -70,8 +70,9 @@ def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> No
     for name in ("masked", "segmented"):
         pixels = np.stack([np.asarray(getattr(one, name)) for one in state.keyframes])
         arrays[f"keyframes.{name}"] = np.packbits(pixels, axis=-1)
-    if start.masked is not None:
-        arrays["masked"] = start.masked
+    for name in ("masked", "core"):
+        if getattr(start, name) is not None:
+            arrays[name] = getattr(start, name)
     if start.T_level_world is not None:
         arrays["T_level_world"] = start.T_level_world
     if start.placement is not None:
@@ -142,6 +143,7 @@ def _start(kept: dict[str, np.ndarray], about: dict[str, Any]) -> Start:
     return Start(
         index=about["index"],
         masked=kept.get("masked"),
+        core=kept.get("core"),
         box=Box(kept["box"], kept["size"], kept["exclude"]),
         T_world_camera=kept["start"],
         T_level_world=kept.get("T_level_world"),
@@ -177,7 +179,7 @@ def _state(
         odometry = T_previous, information
         prepared = prepared._replace(masked=masked)
         if start.T_level_world is not None and frame.mask is None:
-            prepared = prepared._replace(parts=parts_in(prepared, first=number == 0))
+            prepared = prepared._replace(parts=parts_in(prepared, None if number else start.core))
         keyframes.append(keyframe_of(prepared, place, T, odometry, segmented))
     assert view is not None
     return assemble(

@@ -182,6 +182,8 @@ def read_ply(path: str | os.PathLike[str]) -> MeshFile:
     mesh: Any = trimesh.load_mesh(content, file_type="ply", process=False)
     if len(mesh.faces) == 0 or not (np.abs(mesh.vertices) <= limits.FAR).all():
         raise ValueError(f"it has no faces, or vertices farther than {limits.FAR:g} m")
+    if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise ValueError("its faces have vertices that are not there")
     vertex = mesh.metadata["_ply_raw"]["vertex"]
     measured = vertex["data"]["measured"] > 0 if "measured" in vertex["properties"] else None
     visual: Any = mesh.visual

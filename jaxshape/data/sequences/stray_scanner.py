@@ -89,6 +89,8 @@ def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
         ]
         table = np.array([row + [np.nan] * (len(names) - len(row)) for row in rows])
         table = table.reshape(-1, len(names))
+        if not len(table):
+            raise ValueError("it has no rows")
         if not np.isfinite(table[:, names.index("frame")]).all():
             raise ValueError("a row has no frame")
     except ValueError as error:

@@ -4,6 +4,7 @@ import json
 import os
 import struct
 import zlib
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -147,6 +148,21 @@ def test_a_list_names_files_of_its_own_folder_only(tmp_path, name):
         file.write(f"200.0 {name}\n")
     said = fault_of(tmp_path / "scan")
     assert "outside of" in said or "expected a path" in said
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="open files are not listed here")
+def test_no_file_stays_open(tmp_path):
+    for number, damage in enumerate((None, png_header(50_000, 50_000), EPS)):
+        write_open3d(tmp_path / str(number), SEEN)
+        if damage is not None:
+            (tmp_path / str(number) / "depth" / "depth_1.png").write_bytes(damage)
+    before = len(os.listdir("/proc/self/fd"))
+    for number in range(60):
+        sequence = open_sequence(tmp_path / str(number % 3))
+        for index in (0, 1):
+            with suppress(SequenceError):
+                sequence[index]
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 # Numbers ---------------------------------------------------------------------------------------
