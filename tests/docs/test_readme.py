@@ -54,6 +54,12 @@ NOT_RUN = {
     "git clone <this repository> && cd jaxshape": "fetches",
     "pip install jaxshape": "installs",
     "jaxshape view out/reconstruct": "serves until it is stopped; tests/report/test_viewer.py",
+    "srun --ntasks-per-node=1 jaxshape evaluate --distributed --meshes chairs/"
+    " --output scores.json": "needs a cluster",
+    "jaxshape evaluate --coordinator first-host:1234 --processes 2 --process 0 --meshes chairs/"
+    " --output scores.json": "needs two machines; tests/test_hosts.py runs it on one",
+    "jaxshape evaluate --coordinator first-host:1234 --processes 2 --process 1 --meshes chairs/"
+    " --output scores.json": "needs two machines; tests/test_hosts.py runs it on one",
     "python experiments/mugs.py --output data/mugs": "tests/experiments/test_mugs.py runs it",
 }
 """Commands, by the reason."""
