@@ -58,6 +58,8 @@ NOT_RUN = {
     "pip install jaxshape": "installs",
     "jaxshape view out/reconstruct": "serves until it is stopped; tests/report/test_viewer.py",
     "jaxshape bench": "tests/bench runs it",
+    "srun --ntasks-per-node=1 jaxshape evaluate": "needs a cluster",
+    "jaxshape evaluate --coordinator": "needs two machines; tests/test_hosts.py runs it on one",
     "python experiments/mugs.py --output data/mugs": "tests/experiments/test_mugs.py runs it",
 }
 """How commands begin, by the reason."""
