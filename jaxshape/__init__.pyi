@@ -47,9 +47,11 @@ from .results.surface import surface, write_mesh
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
 from .search.composition import Composition, complete, compose
 from .search.config import RefineConfig
+from .search.export import export_reconstruct, load_reconstruct
 from .search.methods import build_refiner
 from .search.methods.cma import cma
 from .search.methods.evosax import evosax_strategy
+from .search.methods.gauss_newton import gauss_newton
 from .search.methods.gradient import gradient
 from .search.methods.hybrid import polished
 from .search.objective import objective
@@ -161,6 +163,7 @@ __all__ = [
     "enter_benchmark",
     "equation_7",
     "evosax_strategy",
+    "export_reconstruct",
     "f_score",
     "find_start",
     "finite_or_inf",
@@ -170,11 +173,13 @@ __all__ = [
     "follow",
     "fuse_frames",
     "fuse_surface",
+    "gauss_newton",
     "gradient",
     "iou",
     "keep_better",
     "load",
     "load_prior",
+    "load_reconstruct",
     "measure",
     "measure_frames",
     "merge",

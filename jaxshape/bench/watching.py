@@ -9,7 +9,6 @@ three and counts as three.
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
+
+from jaxshape.search.curvature import Composed
 
 GRADIENT = 3
 """Decoder calls that a value with its gradient counts as."""
@@ -125,8 +126,8 @@ def watched(
     """The objectives of some problems, watched.
 
     Args:
-        objective_of: The objective of a problem, by its number. One that has an `expansion`, the
-            objective to second order, keeps it.
+        objective_of: The objective of a problem, by its number. One that is `Composed`, so that a
+            search can ask for it to second order, stays so.
         observer: Learns of every evaluation.
         to_code: The code of a point that the objectives take.
 
@@ -160,9 +161,7 @@ def watched(
             cost = GRADIENT * (1 + len(found.directions))
             return found._replace(loss=told(cost, owner, point, found.loss))
 
-        if not hasattr(objective, "expansion"):
-            return loss
-        return replace(objective, loss=loss, expansion=expansion)
+        return Composed(loss, expansion) if isinstance(objective, Composed) else loss
 
     return watched_of
 

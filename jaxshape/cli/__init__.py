@@ -11,7 +11,7 @@ leaves earlier output as it was. JAX, and all that needs it, is imported inside 
     inspecting inspect
     learning   dataset, train
     scoring    evaluate, plot
-    benchmarking  bench
+    benchmarking bench
     viewing    view
     doctor     doctor
 """
