@@ -192,10 +192,9 @@ def faults(entry: Entry, problems: Sequence[Problem]) -> list[str]:
 
 def _fault(row: Row, problem: Problem, budget: int) -> str | None:
     """What is wrong with a row."""
-    objective, ious, reached = (
-        np.array(row[key], float) for key in ("objective", "iou", "reached")
-    )
-    goals = np.array(targets(problem))
+    objective, ious = np.array(row["objective"], float), np.array(row["iou"], float)
+    # A row without any target reached has pairs too, none.
+    reached, goals = np.array(row["reached"], float).reshape(-1, 2), np.array(targets(problem))
     if objective.shape != (len(LADDER),) or ious.shape != (len(LADDER),):
         return f"objectives and IoU are not given at the {len(LADDER)} numbers of decoder calls"
     if not (np.isfinite(objective).all() and np.diff(objective).max() <= 0):

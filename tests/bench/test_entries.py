@@ -33,6 +33,13 @@ def test_a_run_is_valid_and_says_how_it_was_made(entry, two):
     assert machine["packages"]["jax"] and {row["together"] for row in entry.rows.values()} == {1}
 
 
+def test_a_search_that_reached_no_target_is_valid(entry, two):
+    one = two[0]
+    rows = {one.name: entry.rows[one.name] | {"reached": []}}
+    lower = one._replace(best_objective=float(one.first_objective) - 100)  # far below all found
+    assert faults(entry._replace(rows=rows), [lower]) == []
+
+
 def cheated(**changes):
     return lambda row: row.update({k: f(copy.deepcopy(row[k])) for k, f in changes.items()})
 
