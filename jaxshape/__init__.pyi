@@ -1,3 +1,6 @@
+from .bench.ask_tell import AskTell
+from .bench.own_loop import Watch, enter_benchmark
+from .bench.problems import Problem, problems
 from .data.archives import MeshSource
 from .data.boxes import Box
 from .data.capture import (
@@ -88,6 +91,7 @@ from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",
+    "AskTell",
     "BALANCED",
     "Bounds",
     "Box",
@@ -113,6 +117,7 @@ __all__ = [
     "PlacementConfig",
     "Prepared",
     "PreparedFrame",
+    "Problem",
     "Progress",
     "Prompt",
     "Reconstruction",
@@ -136,6 +141,7 @@ __all__ = [
     "TrackingConfig",
     "Trajectory",
     "VirtualCamera",
+    "Watch",
     "Weights",
     "binary",
     "bounds",
@@ -154,6 +160,7 @@ __all__ = [
     "decode",
     "decode_prepared",
     "encode",
+    "enter_benchmark",
     "equation_7",
     "evosax_strategy",
     "export_reconstruct",
@@ -184,6 +191,7 @@ __all__ = [
     "orbit",
     "place",
     "polished",
+    "problems",
     "random_chair",
     "random_table",
     "random_views",

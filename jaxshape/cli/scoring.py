@@ -37,7 +37,7 @@ class Evaluate:
     """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
     family: FamilyName = "chair"
-    """Class of the procedural objects, and of the weights where none are given."""
+    """Class of the objects. Without --weights, tables too are rebuilt by the network for chairs."""
     count: int = 0
     """Number of procedural test objects to use instead of --meshes."""
     frames: str = "1,4,8,18"
@@ -65,7 +65,7 @@ class Evaluate:
 
         from jaxshape.data.archives import list_meshes
         from jaxshape.data.families import TEST_SEEDS, procedural_objects
-        from jaxshape.model.weights import load_prior
+        from jaxshape.model.weights import load_prior, packaged_for
         from jaxshape.results import evaluation
         from jaxshape.results.journal import Share
 
@@ -83,7 +83,8 @@ class Evaluate:
         )
         procedural = procedural_objects(self.family, self.count, TEST_SEEDS)
         sources = list_meshes(self.meshes) if self.meshes else procedural
-        prior = load_prior(self.weights or self.family)
+        packaged = packaged_for(self.family)
+        prior = load_prior(self.weights or packaged)
         evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
         share = Share(jax.process_index(), jax.process_count())
         models, skipped = load_models(share.of(sources), self.axes, refuse=share.count == 1)
@@ -92,7 +93,7 @@ class Evaluate:
         about = {
             "meshes": str(self.meshes or f"{self.count} procedural {self.family}s"),
             **asdict(self.axes),
-            "weights": str(self.weights) if self.weights else f"{self.family} (packaged)",
+            "weights": str(self.weights) if self.weights else f"{packaged} (packaged)",
         }
         names = [source.name for source in sources]
         score(self.output, prior, config, about, models, skipped, names, share)
