@@ -47,12 +47,15 @@ class MeshSource(NamedTuple):
         member: Name of the member inside the archive; None for a file of its own.
         metadata: Entries of a furniture catalogue for the mesh, under the catalogue's own field
             names; else empty.
+        axes: Axes of this file that point up and to the front, as ("z", "-y"); None where they are
+            those of its collection.
     """
 
     name: str
     path: str
     member: str | None = None
     metadata: dict[str, str] = {}  # noqa: RUF012 - never written to
+    axes: tuple[str, str] | None = None
 
 
 class TooLarge(ValueError):

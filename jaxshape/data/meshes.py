@@ -113,7 +113,8 @@ def load(
 
     Args:
         source: The mesh, from `jaxshape.data.archives.list_meshes`.
-        up: Axis of the file that points up: `x`, `y`, `z`, or one of these with a minus.
+        up: Axis of the file that points up, unless the source says it: `x`, `y`, `z`, or one of
+            these with a minus.
         front: Axis of the file along which the object's front looks, perpendicular to `up`.
         unit: Unit of the file: "m", "cm", "mm" or "inch".
 
@@ -123,6 +124,7 @@ def load(
     Raises:
         ValueError: The axes are not perpendicular axes.
     """
+    up, front = source.axes or (up, front)
     axes_to_canonical(up, front)
     try:
         parsed, notes = _parse(source, up)
@@ -199,7 +201,8 @@ def digest(source: MeshSource) -> str:
     for name in referred(content):
         with suppress(Exception):  # what is missing or broken is reported by whoever needs it
             found.update(read_bytes(source, name))
-    found.update(repr(sorted(source.metadata.items())).encode("utf-8", "surrogateescape"))
+    about = sorted(source.metadata.items()), source.axes
+    found.update(repr(about).encode("utf-8", "surrogateescape"))
     return found.hexdigest()
 
 
