@@ -1,7 +1,6 @@
 """`jaxshape evaluate` and `jaxshape plot`: how good results are, and how a search went."""
 
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
+from jaxshape.cli.collection import check_axes, find_meshes, load_models, turned
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Seen, checked_numbers
 from jaxshape.files import write_json
@@ -47,8 +47,8 @@ class Evaluate:
     """Seed of noise, surface samples and searches, 0 or more."""
 
     def run(self) -> None:
-        from jaxshape.data.archives import list_meshes
         from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.meshes import lying_on_its_side
         from jaxshape.model.weights import load_prior
         from jaxshape.results import evaluation
 
@@ -65,53 +65,24 @@ class Evaluate:
             "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",
         )
         test_seeds = range(TEST_SEEDS, TEST_SEEDS + self.chairs)
-        sources = list_meshes(self.meshes) if self.meshes else test_seeds
+        sources: Any = find_meshes(self.meshes) if self.meshes else test_seeds
         prior = load_prior(self.weights)
         evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
+        known = prior if self.weights else None
+        if self.meshes:
+            sources = turned(sources, self.axes, known)
         models, skipped = load_models(sources, self.axes)
-        _check_upright(models, refuse=self.weights is None)
+        if self.meshes:
+            lying = [model.name for model in models if lying_on_its_side(model.mesh)]
+            usable = {model.name for model in models}
+            sources = [source for source in sources if source.name in usable]
+            check_axes(sources, lying, self.axes, prior=known, refuse=self.weights is None)
         about = {
             "meshes": str(self.meshes) if self.meshes else f"{self.chairs} procedural chairs",
             **asdict(self.axes),
             "weights": str(self.weights) if self.weights else "chair (packaged)",
         }
         score(self.output, prior, config, about, models, skipped)
-
-
-def load_models(sources: Sequence[Any], axes: Axes) -> tuple[list[Any], list[Any]]:
-    """The meshes (`Model`) that can be used, and those that are `Skipped`."""
-    from jaxshape.data.dataset import load_object
-    from jaxshape.data.meshes import Skipped
-
-    with progress_bar("meshes") as bar:
-        task = bar.add_task("read", note="")
-        watched = bar.track(sources, task_id=task)
-        found = [load_object(source, up=axes.up, front=axes.front) for source in watched]
-    skipped = [f for f in found if isinstance(f, Skipped)]
-    models = [f for f in found if not isinstance(f, Skipped)]
-    report_skipped(skipped)
-    require(
-        bool(models),
-        f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
-        f"{skipped[0].reason}. {skipped[0].detail}"
-        if skipped
-        else "",
-    )
-    return models, skipped
-
-
-def _check_upright(models: Sequence[Any], *, refuse: bool) -> None:
-    """Refuse a set of seats that seems to lie on its side; other weights may be of other things."""
-    from jaxshape.data.meshes import lying_on_its_side
-
-    lying = [model.name for model in models if lying_on_its_side(model.mesh)]
-    if 2 * len(lying) > len(models):
-        complaint = (
-            f"{len(lying)} of {len(models)} meshes seem to lie on their side, {lying[0]!r} for "
-            "one{}; name the axis that points up, for example --up z --front -y."
-        )
-        require(not refuse, complaint.format(""))
-        warnings.warn(complaint.format(", if they are seats"), stacklevel=2)
 
 
 def score(
@@ -138,17 +109,22 @@ def score(
     # Beside the results file until that is written.
     partial = output.with_name(output.name + ".partial")
     journal = Journal(partial, settings | {"fingerprint": fingerprint(prior)})
+    contents = {model.name: model.digest for model in models}
+    stale = [n for n, row in journal.rows.items() if row.get("content") != contents.get(n)]
+    journal.forget(stale)  # files that have changed since they were scored
     left = [model for model in models if model.name not in journal.rows]
+    unseen = []
     with progress_bar("meshes") as bar:
         task = bar.add_task("evaluate", total=len(models), completed=len(journal.rows), note="")
         for scores in evaluation.evaluate(prior, left, config):
             if isinstance(scores, Skipped):
-                skipped = [*skipped, scores]
-                report_skipped([scores])
+                unseen.append(scores)
             else:
                 journal.add({scores["name"]: scores}, time.perf_counter() - start)
                 start = time.perf_counter()
             bar.update(task, advance=1)
+    report_skipped(unseen)
+    skipped = [*skipped, *unseen]
     require(bool(journal.rows), "No mesh could be scored; see the reasons above.")
     per_mesh = list(journal.rows.values())
     content = {

@@ -101,9 +101,17 @@ def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
 
 
 class _Walked(NamedTuple):
+    """What a folder holds.
+
+    Attributes:
+        files: All files that are not hidden.
+        closed: Folders that cannot be opened.
+        links: Number of links to folders, which are not followed.
+    """
+
     files: list[Path]
-    closed: list[Path]  # folders that cannot be opened
-    links: int  # to folders, which are not followed
+    closed: list[Path]
+    links: int
 
 
 def _walk(folder: Path) -> _Walked:

@@ -14,6 +14,9 @@ CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
+UpFront = tuple[str, str]
+"""Axes of a mesh that point up and to the front, as ("z", "-y")."""
+
 UnitName = Literal["m", "cm", "mm", "inch"]
 
 UNITS: dict[UnitName, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}

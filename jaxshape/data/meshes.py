@@ -22,7 +22,7 @@ from jaxshape.data.formats import read_parts
 from jaxshape.data.formats.gltf_data import referred
 from jaxshape.data.formats.parts import NotSupported, TooManyFaces, Unreadable
 from jaxshape.data.helpers import without_helpers
-from jaxshape.data.orientation import apparent_up
+from jaxshape.data.orientation import SEAT, apparent_up, up_scores
 
 __all__ = [
     "MeshSource", "Model", "Skipped", "axes_to_canonical", "canonical", "list_meshes", "load",
@@ -304,3 +304,12 @@ def lying_on_its_side(mesh: trimesh.Trimesh) -> bool:
     So believe it of a set of meshes, by majority; stools and poufs look much the same either way.
     """
     return apparent_up(sample_surface(mesh, 6000, seed=0)) != "y"
+
+
+def resembles_a_seat(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh stands in one of the directions along its axes as seats and tables do.
+
+    Args:
+        mesh: The mesh, however it lies.
+    """
+    return max(up_scores(sample_surface(mesh, 6000, seed=0)).values()) > SEAT

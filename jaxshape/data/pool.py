@@ -144,6 +144,12 @@ def _exit_code(worker: _Worker) -> int:
 
 
 class _Returned(NamedTuple):
+    """The answer of a process whose function returned.
+
+    Attributes:
+        value: The result of the function.
+    """
+
     value: Any
 
     def __call__(self) -> Any:
@@ -151,6 +157,12 @@ class _Returned(NamedTuple):
 
 
 class _Raised(NamedTuple):
+    """The answer of a process whose function raised.
+
+    Attributes:
+        problem: What the function raised.
+    """
+
     problem: Exception
 
     def __call__(self) -> Any:

@@ -1,6 +1,7 @@
 """Rows of a long run, kept as they come: a killed run goes on after its last row. [host]"""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,15 @@ class Journal:
         self.rows |= rows
         self.seconds += seconds
         self.write({})
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Leave out rows that are no longer true; the file follows with the next that comes.
+
+        Args:
+            names: Names of the rows.
+        """
+        for name in names:
+            del self.rows[name]
 
     def write(self, findings: dict[str, Any]) -> None:
         """Write the file anew, with what the rows say put before them."""

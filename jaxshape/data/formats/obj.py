@@ -16,7 +16,12 @@ NOT_POLYGONS = {
 
 
 class _Face(NamedTuple):
-    """Corners of a face as they stand in the file, and how many vertices stand before it."""
+    """A face as it stands in the file.
+
+    Attributes:
+        corners: Words of its corners, such as `3/1/2`.
+        before: How many vertices stand before it.
+    """
 
     corners: list[str]
     before: int

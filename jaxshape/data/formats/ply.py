@@ -17,12 +17,28 @@ _CORNERS = ("vertex_indices", "vertex_index")
 
 
 class _Property(NamedTuple):
+    """A property of an element.
+
+    Attributes:
+        name: Its name.
+        type: NumPy's name of the type of its numbers.
+        count: The same of the length of a list; None for a single number.
+    """
+
     name: str
     type: str
-    count: str | None  # type of a list's length; None for a single number
+    count: str | None
 
 
 class _Element(NamedTuple):
+    """An element of the file: a table.
+
+    Attributes:
+        name: Its name, such as `vertex`.
+        length: Number of its rows.
+        properties: Its columns.
+    """
+
     name: str
     length: int
     properties: list[_Property]
