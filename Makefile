@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo paper test test-slow lint clean
+.PHONY: install demo docs paper test test-slow fuzz kills audit lowest wheel lint clean
 
 install: $(VENV)/.runtime
 
@@ -49,6 +49,55 @@ test: $(VENV)/.develop
 
 test-slow: $(VENV)/.develop
 	$(BIN)/python -m pytest -m slow
+
+# Every reader against damaged files for FUZZ_SECONDS; what breaks one is left as crash-... here.
+# atheris needs Python 3.11 to 3.13 and Linux.
+FUZZ_SECONDS ?= 120
+READERS := json trajectory box journal image recording npz mesh cloud weights result
+
+fuzz: $(VENV)/.develop
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[fuzz]'
+	for reader in $(READERS); do \
+		$(BIN)/python tests/fuzz/fuzz.py $$reader -max_total_time=$(FUZZ_SECONDS) -timeout=25 \
+			-rss_limit_mb=4096 -print_final_stats=1 || exit 1; \
+	done
+
+# Commands are killed at random and given again; they end as if nothing had been.
+KILLS ?= 50
+
+kills: $(VENV)/.develop
+	$(BIN)/python tests/kills.py --kills $(KILLS)
+
+# Known vulnerabilities of what is installed.
+audit: $(VENV)/.develop
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[audit]'
+	$(BIN)/python -m pip_audit --skip-editable
+
+# The oldest versions that pyproject.toml allows, in an environment of their own, and the tests there
+# without the checks of types.
+lowest: $(VENV)/.develop
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/python -m uv pip compile --quiet --resolution lowest-direct --extra dev \
+		--output-file out/lowest.txt pyproject.toml
+	$(BIN)/python -m uv venv --quiet --python $(BIN)/python out/lowest
+	$(BIN)/python -m uv pip install --quiet --python out/lowest/bin/python -r out/lowest.txt
+	$(BIN)/python -m uv pip install --quiet --python out/lowest/bin/python --no-deps --editable .
+	OPENBLAS_NUM_THREADS=1 out/lowest/bin/python -m pytest -n auto --dist loadfile \
+		--override-ini "addopts=-m 'not slow'"
+
+# Into out/site; a warning is an error.
+docs: $(VENV)/.runtime
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
+# Built, installed into a fresh environment, and tried from an empty folder.
+wheel: $(VENV)/.runtime
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
+	rm -rf out/wheel && $(BIN)/python -m build --quiet --wheel --outdir out/wheel
+	find out/wheel -name '*.whl' -size -20000k | grep .
+	$(PYTHON) -m venv out/wheel/venv
+	out/wheel/venv/bin/python -m pip install --quiet --disable-pip-version-check out/wheel/*.whl
+	mkdir out/wheel/empty && cd out/wheel/empty && ../venv/bin/jaxshape doctor && ../venv/bin/jaxshape demo
 
 lint: $(VENV)/.develop
 	$(BIN)/ruff check .

@@ -1,14 +1,17 @@
-r"""The 78 CAD seats that all experiments are tested on, from two packages that anyone can install.
+r"""The 78 CAD seats and 62 CAD tables of the tests, from two packages that anyone can install.
 
     mkdir packages && cd packages
     apt-get download sweethome3d-furniture && dpkg-deb -x sweethome3d-furniture_*.deb .
     npm pack open3dfloorplan@1.1.4 && tar -xzf open3dfloorplan-1.1.4.tgz && cd ..
     python experiments/cad_seats.py --packages packages/ --output cad_chairs/
+    python experiments/cad_seats.py --packages packages/ --output cad_tables/ --list tables
 
-Debian's `sweethome3d-furniture` 1.8-1 (any release that has it, or packages.debian.org) holds 67 of
-them in furniture catalogues, whose rotations and sizes are applied; npm's `open3dfloorplan` holds
-11 of Kenney's Furniture Kit. Which they are, what kind of seat, who made it and under which licence
-(CC0 or CC-BY: name the creator) is listed in experiments/cad_seats.json.
+Debian's `sweethome3d-furniture` 1.8-1 (any release that has it, or packages.debian.org) holds 67
+seats and 52 tables in furniture catalogues, whose rotations and sizes are applied; npm's
+`open3dfloorplan` holds 11 and 10 of Kenney's Furniture Kit. experiments/cad_seats.json and
+cad_tables.json list which they are, of what kind, who made them and under which licence (CC0 or
+CC-BY: name the creator). The tables are all that the packages hold, desks and night stands
+among them, but for copies of the same mesh in another material.
 
 Writes a folder of PLY files in the canonical frame (metres, +y up, front along +z, centred) and
 manifest.json, which says of each what the list does. No model is trained on them. Time: 20 seconds.
@@ -19,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -29,9 +32,9 @@ from jaxshape.data.meshes import MeshSource, Model, Skipped, list_meshes, load
 from jaxshape.files import write_json
 from jaxshape.results.surface import write_mesh
 
-LIST = Path(__file__).with_suffix(".json")
+LISTS = {name: Path(__file__).with_name(f"cad_{name}.json") for name in ("seats", "tables")}
 SIZE_TOLERANCE = 0.002
-"""Metres by which a seat may differ from the size in the list."""
+"""Metres by which a piece may differ from the size in the list."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +45,16 @@ class Config:
     """The folder both packages were unpacked in: it has `usr/` and `package/`."""
     output: Path = Path("cad_chairs")
     """Folder to write."""
+    list: Literal["seats", "tables"] = "seats"
+    """What to write."""
 
 
-class Seat(NamedTuple):
-    """One seat of the list."""
+class Piece(NamedTuple):
+    """One piece of furniture of a list."""
 
     name: str
     kind: str
-    """chair, armchair, stool or other_seat."""
+    """chair, armchair, stool or other_seat; table, low_table or desk."""
     title: str
     creator: str
     licence: str
@@ -65,43 +70,43 @@ class Seat(NamedTuple):
 
 def main(config: Config) -> None:
     try:
-        collect(read_list(), config.packages, config.output)
+        collect(read_list(LISTS[config.list]), config.packages, config.output)
     except ValueError as problem:
         raise SystemExit(str(problem)) from problem
 
 
-def read_list(path: Path = LIST) -> list[Seat]:
-    """The seats of a list, in its order."""
-    return [Seat(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
+def read_list(path: Path) -> list[Piece]:
+    """The pieces of a list, in its order."""
+    return [Piece(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
 
 
-def collect(seats: Sequence[Seat], packages: Path, output: Path) -> None:
-    """Write all seats and their manifest.
+def collect(pieces: Sequence[Piece], packages: Path, output: Path) -> None:
+    """Write all pieces and their manifest.
 
-    `ValueError` where a seat is not found in its package, cannot be read, or has another size.
+    `ValueError` where a piece is not found in its package, cannot be read, or has another size.
     """
-    for seat in track(seats, description="CAD seats"):
-        write_mesh(read_seat(seat, packages).mesh, output / f"{seat.name}.ply")
-    write_json(output / "manifest.json", [seat._asdict() for seat in seats])
+    for piece in track(pieces, description="CAD furniture"):
+        write_mesh(read_piece(piece, packages).mesh, output / f"{piece.name}.ply")
+    write_json(output / "manifest.json", [piece._asdict() for piece in pieces])
 
 
-def read_seat(seat: Seat, packages: Path) -> Model:
-    """One seat in the canonical frame, as its catalogue turns and scales it."""
-    source = _sources(packages / seat.file).get(seat.member)
+def read_piece(piece: Piece, packages: Path) -> Model:
+    """One piece in the canonical frame, as its catalogue turns and scales it."""
+    source = _sources(packages / piece.file).get(piece.member)
     found = None if source is None else load(source)
     if found is None or isinstance(found, Skipped):
-        reason = f"is not in {packages / seat.file}" if found is None else found.detail
+        reason = f"is not in {packages / piece.file}" if found is None else found.detail
         raise ValueError(
-            f"{seat.name} cannot be read: {seat.member or 'the mesh'} {reason}. It comes with "
-            f"{seat.package}; unpack that version into {packages}, as "
+            f"{piece.name} cannot be read: {piece.member or 'the mesh'} {reason}. It comes with "
+            f"{piece.package}; unpack that version into {packages}, as "
             "experiments/cad_seats.py says at its top."
         )
     size = found.mesh.extents
-    if not np.allclose(size, seat.size, atol=SIZE_TOLERANCE, rtol=0):
+    if not np.allclose(size, piece.size, atol=SIZE_TOLERANCE, rtol=0):
         raise ValueError(
-            f"{seat.name} measures {np.round(size, 3).tolist()} m, but {seat.size} m were "
-            f"expected: {packages / seat.file} is of another version than that of {seat.package}. "
-            f"Unpack that one into {packages}."
+            f"{piece.name} measures {np.round(size, 3).tolist()} m, but {piece.size} m were "
+            f"expected: {packages / piece.file} is of another version than that of "
+            f"{piece.package}. Unpack that one into {packages}."
         )
     return found
 

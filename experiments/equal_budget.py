@@ -366,15 +366,15 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         _ranked(config.searches, f"Which search is best after {whole:.1f} s a chair?", in_seconds),
         Claim(
             "beyond",
-            "17 candidates are better than more in fewer iterations",
+            "Populations of 17 are better than larger populations in fewer iterations",
             f"IoU {over(populations)}",
             holds(populations),
         ),
         Claim(
             "beyond",
             "Restarts help",
-            f"CMA-ES ends by itself within {budget} calls on {ended.sum()} of {len(ended)} chairs",
-            "nothing to restart"
+            f"CMA-ES stops by itself within {budget} calls on {ended.sum()} of {len(ended)} chairs",
+            "no search to restart"
             if not ended.any()
             else "yes"
             if ahead("IPOP").mean() < 0
@@ -384,7 +384,7 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
             "beyond",
             "A lower objective is a better shape",
             f"Rank correlation by chair {mean_interval(every)} over all searches and budgets,"
-            f" {mean_interval(final)} among searches that have spent theirs",
+            f" {mean_interval(final)} among finished searches",
             "along a search"
             if every.mean() > 0.5 > final.mean()
             else "yes"
@@ -393,10 +393,10 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         ),
         Claim(
             "beyond",
-            "IoU still rises while the lowest objective falls further",
-            f"In the second half of the budget of {lowest}: objective {objective.mean():+.4f}, IoU"
-            f" {mean_interval(gain)}, falling on {(gain < 0).sum()} of {len(gain)} chairs",
-            "yes" if interval(gain)[0] > 0 else "not to speak of",
+            "IoU still rises in the second half of the best search",
+            f"Change in the second half of {lowest}: objective {objective.mean():+.4f}, IoU"
+            f" {mean_interval(gain)}; IoU falls on {(gain < 0).sum()} of {len(gain)} chairs",
+            "yes" if interval(gain)[0] > 0 else "no",
         ),
     ]
 
@@ -406,7 +406,9 @@ def _ranked(searched: Sequence[str], question: str, scores: Callable[[str], np.n
     ranked = sorted(searched, key=lambda name: -scores(name).mean())
     order = ", ".join(f"{name} {scores(name).mean():.3f}" for name in ranked)
     lead = mean_interval(scores(ranked[0]) - scores("CMA-ES"))
-    return Claim("beyond", question, f"IoU {order}; the first over CMA-ES {lead}", ranked[0])
+    return Claim(
+        "beyond", question, f"IoU: {order}. Lead of the first over CMA-ES: {lead}", ranked[0]
+    )
 
 
 # ------------------------------------------------------------------ figure

@@ -224,9 +224,9 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         Claim(
             "Fig. mapping",
             "Most refined results exceed those of the auto-encoder",
-            f"Of {len(gains)} chairs have a higher IoU once refined: {counts} frames; "
-            f"gained on average {gains[:, 0].mean():+.3f} at {config.frames[0]}, "
-            f"{gains[:, -1].mean():+.3f} at {config.frames[-1]}",
+            f"Chairs out of {len(gains)} whose IoU is higher after refinement: {counts} frames."
+            f" Mean gain {gains[:, 0].mean():+.3f} at {config.frames[0]} frames,"
+            f" {gains[:, -1].mean():+.3f} at {config.frames[-1]}",
             "yes" if share > 0.5 else "no",
         )
     ]

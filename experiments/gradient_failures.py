@@ -351,12 +351,12 @@ def _trapped(rows: Sequence[Rows], loser: str, winner: str, config: Config) -> C
     count = len(rows)
     return Claim(
         "Fig. gm_fail" if loser == "gradient descent" else "beyond",
-        f"{loser[0].upper()}{loser[1:]} is trapped in a local minimum that {winner} gets out of",
-        f"Of {count} chairs chosen for the lead of {winner}, after {config.iterations} iterations"
-        f" its IoU is higher on {better.sum()} and its objective lower on {lower.sum()}; from where"
-        f" {loser} has ended {winner} lowers the objective by {others.mean():.1%}, {loser} by"
-        f" {own.mean():.1%} and Adam by {adam.mean():.1%}; a ridge parts the two ends on"
-        f" {ridges.sum()}",
+        f"{loser[0].upper()}{loser[1:]} is trapped in a local minimum that {winner} leaves",
+        f"{count} chairs were chosen for the lead of {winner}. After {config.iterations} iterations"
+        f" its IoU is higher on {better.sum()} of them and its objective lower on {lower.sum()}."
+        f" Started at the end point of {loser}, {winner} lowers the objective by"
+        f" {others.mean():.1%}, {loser} by {own.mean():.1%} and Adam by {adam.mean():.1%}. A ridge"
+        f" separates the two end points on {ridges.sum()}",
         f"on {trapped.sum()} of {count}" if trapped.any() else "no",
     )
 
@@ -374,7 +374,7 @@ def _how_often(shares: dict[str, Any]) -> Claim:
     return Claim(
         "Fig. gm_fail",
         "CMA-ES uses additional frames where gradient descent is stuck",
-        f"IoU of {chairs:.0f} chairs after short searches, " + "; ".join(texts),
+        f"IoU of CMA-ES on {chairs:.0f} chairs after short searches, " + "; ".join(texts),
         "on most chairs" if all(most) else "on few chairs" if not any(most) else "in part",
     )
 

@@ -135,7 +135,7 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
             f"IoU of CMA-ES at {config.frames[-2]} frames, " + "; ".join(map(over_descent, found)),
             "yes"
             if all(over.values())
-            else "of plain descent"
+            else "true of plain descent only"
             if over["gradient descent"]
             else "no",
         ),

@@ -48,7 +48,7 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for, search_space
 from jaxshape.search.residuals import BALANCED, SOFT, Target
 from jaxshape.search.run import refine
-from study import Claim, conclude, listed, name_of
+from study import Claim, conclude, listed
 
 RESULTS = Path(__file__).parent / "results"
 SEATS_AT_A_TIME = 4
@@ -110,7 +110,7 @@ def run(config: Config) -> Journal:
     }
     journal = Journal(config.results / f"{config.name}.json", settings)
     chairs = listed(config.meshes, config.chairs)[: config.chairs]
-    chairs = [chair for chair in chairs if name_of(chair) not in journal.rows]
+    chairs = [chair for chair in chairs if chair.name not in journal.rows]
     rebuild = rebuilder(prior, config.iterations)
     for start in range(0, len(chairs), SEATS_AT_A_TIME):
         began, some = time.perf_counter(), chairs[start : start + SEATS_AT_A_TIME]
@@ -120,7 +120,7 @@ def run(config: Config) -> Journal:
         rows = {}
         for i, chair in enumerate(some):
             mine = slice(i * len(config.frames), (i + 1) * len(config.frames))
-            rows[name_of(chair)] = jax.tree.map(lambda x, s=mine: rounded(x[s]), scores)
+            rows[chair.name] = jax.tree.map(lambda x, s=mine: rounded(x[s]), scores)
         journal.add(rows, time.perf_counter() - began)
         print(f"{len(journal.rows)} of {config.chairs}", flush=True)
     conclude(journal, claims(journal, config), means=means(journal))

@@ -1,10 +1,10 @@
-r"""The README's table of the paper's claims, written from the results files and nothing else.
+r"""The table of the paper's claims in docs/paper.md, written from the results files alone.
 
     python experiments/paper_table.py
 
 Every script of `SCRIPTS` leaves its claims, with the figures found here, in its results file. This
-one puts them into README.md, between the two comments that name it. `--check` only tells whether
-the README says what the files say.
+one puts them into docs/paper.md, between the two comments that name it. `--check` only tells
+whether the page says what the files say.
 """
 
 import json
@@ -37,21 +37,21 @@ class Config:
     """Settings of the table."""
 
     results: Path = ROOT / "experiments" / "results"
-    readme: Path = ROOT / "README.md"
+    page: Path = ROOT / "docs" / "paper.md"
     check: bool = False
-    """Change nothing; exit with 1 where the README says something else than the files."""
+    """Change nothing; exit with 1 where the page says something else than the files."""
 
 
 def main(config: Config) -> None:
-    text = config.readme.read_text()
+    text = config.page.read_text()
     if BEGIN not in text or END not in text:
-        sys.exit(f"{config.readme} has no lines {BEGIN.strip()!r} and {END.strip()!r} to fill.")
+        sys.exit(f"{config.page} has no lines {BEGIN.strip()!r} and {END.strip()!r} to fill.")
     before, rest = text.split(BEGIN)
     _, after = rest.split(END)
     written = before + BEGIN + table(config.results) + END + after
     if config.check:
-        sys.exit(written != text and "The README's table is not that of the results files.")
-    write_text(config.readme, written)
+        sys.exit(written != text and "The table of the page is not that of the results files.")
+    write_text(config.page, written)
 
 
 def table(results: Path) -> str:
@@ -71,7 +71,7 @@ def table(results: Path) -> str:
 def _row(name: str, found: dict[str, Any], claim: dict[str, str]) -> str:
     chairs = sum("group" in row for row in found["rows"].values())
     cost = [f"{chairs} chairs"] * (chairs > 0) + [f"{max(1, round(found['seconds'] / 60))} min"]
-    command = ", ".join([f"[`{name}.py`](experiments/{name}.py)", *cost])
+    command = ", ".join([f"`{name}.py`", *cost])
     cells = (claim["figure"], claim["claim"], claim["holds"], claim["ours"], command)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 

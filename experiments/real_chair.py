@@ -228,8 +228,8 @@ def claims(journal: Journal) -> list[Claim]:
         a, b = end["encoder"], end["refined"]
         return (
             f"{WAYS[way]}, {list(journal.rows[way])[-1]} keyframes: explains "
-            f"{a['explained']:.1%} -> {b['explained']:.1%} of what was measured, fills "
-            f"{a['violated']:.2%} -> {b['violated']:.2%} of what was seen to be free, objective "
+            f"{a['explained']:.1%} -> {b['explained']:.1%} of the measured surface, fills "
+            f"{a['violated']:.2%} -> {b['violated']:.2%} of the measured free space, objective "
             f"{a['objective']:.4f} -> {b['objective']:.4f}"
         )
 
@@ -242,7 +242,7 @@ def claims(journal: Journal) -> list[Claim]:
         Claim(
             "Fig. real_cma_au",
             "On real frames, refinement recovers detail that the auto-encoder alone does not",
-            "Encoder -> refined; " + "; ".join(map(tell, journal.rows)),
+            "From the encoder's shape to the refined shape: " + "; ".join(map(tell, journal.rows)),
             "yes" if all(better) else "partly" if any(better) else "no",
         )
     ]

@@ -18,7 +18,8 @@ from rich.progress import Progress, TimeElapsedColumn
 
 from figures import LINES, PAGE, draw_mean, interval, save_column
 from jaxshape.data.archives import list_meshes
-from jaxshape.data.dataset import TEST_SEEDS, Object, hash_seed, load_object
+from jaxshape.data.dataset import Object, hash_seed, load_object
+from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.data.meshes import Skipped
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
@@ -77,8 +78,8 @@ def subjects(test: TestSet) -> list[Subject]:
 
     `FileNotFoundError` where seats are asked for and there is no folder of meshes.
     """
-    procedural = [Subject(f"chair-{TEST_SEEDS + i}", "procedural", TEST_SEEDS + i)
-                  for i in range(test.chairs)]  # fmt: skip
+    chairs = procedural_objects("chair", test.chairs, TEST_SEEDS)
+    procedural = [Subject(chair.name, "procedural", chair) for chair in chairs]
     seats = list_meshes(test.meshes) if test.seats else []
     cad = [Subject(source.name, "CAD", source) for source in sorted(seats, key=_mix)]
     return sorted(procedural + cad[: test.seats], key=_mix)
@@ -87,13 +88,8 @@ def subjects(test: TestSet) -> list[Subject]:
 def listed(meshes: Path | None, count: int) -> list[Object]:
     """All meshes of a folder, in its order; as many procedural chairs where none is given."""
     if meshes is None:
-        return list(range(TEST_SEEDS, TEST_SEEDS + count))
+        return [*procedural_objects("chair", count, TEST_SEEDS)]
     return [*list_meshes(meshes)]
-
-
-def name_of(chair: Object) -> str:
-    """The name of a chair in results files."""
-    return str(chair) if isinstance(chair, int) else chair.name
 
 
 def _mix(subject: Any) -> int:
@@ -230,7 +226,7 @@ def _rounded(value: Any) -> Any:
 
 
 class Claim(NamedTuple):
-    """What the paper says, and what was found here: a row of the README's table."""
+    """What the paper says, and what was found here: a row of the table in docs/paper.md."""
 
     figure: str
     """Of the paper, or `beyond`."""
@@ -242,7 +238,7 @@ class Claim(NamedTuple):
 
 
 def conclude(journal: Journal, claims: Iterable[Claim], **findings: Any) -> None:
-    """Write what the rows say into the results file: the claims for the README, and more."""
+    """Write what the rows say into the results file: the claims for docs/paper.md, and more."""
     journal.write({"claims": [claim._asdict() for claim in claims]} | findings)
 
 

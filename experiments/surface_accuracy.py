@@ -43,7 +43,7 @@ from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.surface import surface
 from jaxshape.search.composition import compose
-from study import Claim, conclude, listed, name_of
+from study import Claim, conclude, listed
 
 RESULTS = Path(__file__).parent / "results"
 DEVICE = CAMERAS["kinect"]
@@ -89,7 +89,7 @@ def run(config: Config) -> Journal:
     }
     journal = Journal(config.results / "surface_accuracy.json", settings)
     for chair in listed(config.meshes, 78)[:: config.every]:
-        name = name_of(chair)
+        name = chair.name
         if name not in journal.rows:
             began = time.perf_counter()
             journal.add({name: row(chair, prior, config)}, time.perf_counter() - began)

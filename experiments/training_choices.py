@@ -1,6 +1,6 @@
 r"""What each choice in training is worth: small networks at equal budget, judged by what they find.
 
-    jaxshape dataset --output data/chairs --chairs 16000
+    jaxshape dataset --output data/chairs --count 16000
     python experiments/training_choices.py --dataset data/chairs --meshes cad_chairs/
 
 and, for the variant that learns from real chairs made of boxes (research data),

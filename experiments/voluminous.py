@@ -223,8 +223,8 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         )
         empty, full = means(group, "F, occluded empty, of solids", "F, occluded full, of solids")
         return (
-            f"{group}: {surface:.0%} of surfaces, {filled:.0%} of solids; "
-            f"as bounds for solids {empty:.3f} with empty, {full:.3f} with full"
+            f"{group}: {surface:.0%} in surface grids, {filled:.0%} in solid grids; "
+            f"IoU of F for solids {empty:.3f} with occluded voxels empty, {full:.3f} with them full"
         )
 
     at = " / ".join(map(str, config.frames))
@@ -236,21 +236,21 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         Claim(
             "Fig. true_false",
             "On voluminous chairs F with occluded voxels empty is worse than CMA-ES",
-            f"IoU of CMA-ES less F at {at} frames: " + tell("CMA-ES"),
+            f"IoU of CMA-ES minus IoU of F at {at} frames: " + tell("CMA-ES"),
             holds("CMA-ES"),
         ),
         Claim(
             "beyond",
-            "The same with the composed shape, which keeps what was measured",
-            f"IoU of composed less F at {at} frames: " + tell("CMA-ES, composed"),
+            "On voluminous chairs F with occluded voxels empty is worse than the composed shape",
+            f"IoU of the composed shape minus IoU of F at {at} frames: " + tell("CMA-ES, composed"),
             holds("CMA-ES, composed"),
         ),
         Claim(
             "section 4.1",
-            "Most of what is unobserved is empty (said of sparse chairs; voluminous ones here)",
-            f"Occluded voxels that are empty at {config.frames[-1]} frames, "
+            "Most unobserved voxels are empty (the paper: sparse chairs; here: voluminous chairs)",
+            f"Share of occluded voxels that are empty at {config.frames[-1]} frames, "
             + "; ".join(map(tell_empty, found)),
-            {(True, True): "yes", (True, False): "of surfaces, not of solids"}.get(mostly, "no"),
+            {(True, True): "yes", (True, False): "for surfaces, not for solids"}.get(mostly, "no"),
         ),
     ]
 

@@ -32,7 +32,7 @@ Conventions, stated here once:
 Data moves one way, and so do imports:
 
     geometry   cameras, voxel frames, fusion of frames into F and M or signed distances
-    data       meshes, procedural chairs, virtual depth camera, training pairs, RGB-D recordings
+    data       meshes, procedural objects, virtual cameras, training pairs, RGB-D recordings
     model      convolutions, auto-encoder, conditional network, weights, training
     search     objective (Eq. 7), refiners, the batched search, composed shapes
     mapping    segmentation, the object's frame, ICP, keyframes, realignment of a recording

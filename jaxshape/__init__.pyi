@@ -17,6 +17,7 @@ from .data.sequences import (
     read_trajectory,
     write_trajectory,
 )
+from .data.tables import random_table
 from .data.virtual_cameras import SensorNoise, VirtualCamera, virtual_camera
 from .geometry.camera import Intrinsics, orbit, random_views
 from .geometry.distance import DistanceField
@@ -179,6 +180,7 @@ __all__ = [
     "place",
     "polished",
     "random_chair",
+    "random_table",
     "random_views",
     "raw",
     "read_meshes",

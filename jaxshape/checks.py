@@ -2,13 +2,15 @@
 
 A settings dataclass calls them in its `__post_init__`. Each raises a `BadSetting`, a `ValueError`
 that begins with the name of the field, as in "population is 2; give a whole number, 3 or more.";
-the command line puts the name of its option there. Imports nothing of jaxshape.
+the command line puts the name of its option there.
 """
 
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any, NoReturn
+
+from jaxshape.limits import SEED
 
 
 class BadSetting(ValueError):
@@ -52,16 +54,30 @@ def one_of(name: str, value: Any, choices: Iterable[Any]) -> None:
         refuse(name, value, " or ".join(map(repr, choices)))
 
 
-def whole(name: str, value: Any, least: int) -> None:
-    """Refuse what is not a whole number from `least` up.
+def whole(name: str, value: Any, least: int, most: int | None = None, why: str = "") -> None:
+    """Refuse what is not a whole number in a range.
 
     Args:
         name: Name of the field.
         value: The value to check.
         least: The smallest number it takes.
+        most: The largest number it takes; None for any.
+        why: Why it takes no larger one, in a few words.
     """
     if not (_is_number(value) and isinstance(value, Integral) and int(value) >= least):
         refuse(name, value, f"a whole number, {least} or more")
+    if most is not None and int(value) > most:
+        refuse(name, value, f"a whole number, {least} to {most}" + (f": {why}" if why else ""))
+
+
+def seed(name: str, value: Any) -> None:
+    """Refuse what is no seed of random numbers: a whole number of 32 bits.
+
+    Args:
+        name: Name of the field.
+        value: The value to check.
+    """
+    whole(name, value, 0, SEED, "random keys have 32 bits")
 
 
 def positive(name: str, value: Any, unit: str = "") -> None:

@@ -1,12 +1,57 @@
 """Writing files so that a reader never finds half of one."""
 
+import errno
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+TEMPORARY = ".writing-"
+"""How the names of files begin that are being written."""
+
+_REASONS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the quota of its disk is used up",
+    errno.EFBIG: "a file may not become as large there",
+    errno.EROFS: "its disk is read-only",
+    errno.EACCES: "permission to write there is missing",
+    errno.EPERM: "permission to write there is missing",
+    errno.ENOENT: "it was removed meanwhile",
+    errno.ENOTDIR: "a part of the path is a file",
+    errno.EEXIST: "a part of the path is a file",
+}
+
+
+class OutputError(OSError):
+    """A file cannot be written; says which folder, and why."""
+
+
+def unwritable(folder: Path, problem: Exception) -> OutputError | None:
+    """The error that says why nothing can be written to a folder.
+
+    Args:
+        folder: The folder.
+        problem: What a write raised.
+
+    Returns:
+        The error; None where the problem is another.
+    """
+    if isinstance(problem, OutputError):
+        return problem
+    is_full = folder.is_dir() and shutil.disk_usage(folder).free < 2**20
+    if isinstance(problem, OSError) and problem.errno in _REASONS:
+        reason = _REASONS[problem.errno]
+    elif is_full or "requested and" in str(problem):  # as NumPy says it
+        reason = _REASONS[errno.ENOSPC]
+    elif isinstance(problem, OSError):
+        reason = problem.strerror or str(problem)
+    else:
+        return None
+    return OutputError(f"{str(folder)!r} cannot be written: {reason}.")
 
 
 @contextmanager
@@ -16,21 +61,34 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     The temporary file lies in the folder of `path`, which is made if missing, and has its suffix,
     so that libraries that choose a format by suffix choose the right one. If the block raises, the
     temporary file is removed and whatever was at `path` before is still there, unchanged.
+
+    Raises:
+        OutputError: The file cannot be written, as on a full disk.
     """
     target = Path(path)
+    try:
+        temporary = _temporary(target)
+        try:
+            yield temporary
+            temporary.chmod(_mode_of(target))
+            _flush_to_disk(temporary)
+            os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except Exception as problem:
+        if (error := unwritable(target.parent, problem)) is None:
+            raise
+        raise error from problem
+
+
+def _temporary(target: Path) -> Path:
+    """A new empty file beside the one that is to be written."""
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(
-        prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent
+        prefix=f"{TEMPORARY}{target.stem[:100]}-", suffix=target.suffix[:20], dir=target.parent
     )
     os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(_mode_of(target))
-        _flush_to_disk(temporary)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    return Path(name)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -41,7 +99,8 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         text: All that the file will hold.
     """
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # A name that is not UTF-8 on disk has letters that UTF-8 has not.
+        temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:

@@ -2,10 +2,15 @@
 
 import os
 import platform
+import signal
 import sys
+import threading
+import warnings
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, NoReturn
+
+from jaxshape.limits import CACHE_BYTES
 
 
 def prepare_process() -> None:
@@ -16,6 +21,23 @@ def prepare_process() -> None:
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     keep_compiled()
+    end_in_order()
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end, by SIGTERM."""
+
+
+def end_in_order() -> None:
+    """Let SIGTERM end this process as Ctrl-C does; a second one ends it at once."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _terminate)
+
+
+def _terminate(number: int, frame: Any) -> NoReturn:
+    del frame
+    signal.signal(number, signal.SIG_DFL)
+    raise Terminated
 
 
 def keep_compiled() -> None:
@@ -23,16 +45,40 @@ def keep_compiled() -> None:
 
     JAX reads its settings from the environment; those that are set there already win, so
     `JAX_ENABLE_COMPILATION_CACHE=false` turns this off and `JAX_COMPILATION_CACHE_DIR` names
-    another folder. Where the folder cannot be written, nothing is kept.
+    another folder, whose size is then not bounded. Where the folder cannot be written, nothing is
+    kept, and a program that cannot be read again is compiled anew.
     """
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     folder = _folder()
     if folder is None:
         return
+    bound_folder(folder, CACHE_BYTES)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     # By default, only what took a second or more; but a command also compiles dozens of small ones.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def bound_folder(folder: Path, most: int) -> None:
+    """Remove the files of a folder that were used longest ago, where all are larger than allowed.
+
+    Args:
+        folder: The folder, whose sub-folders are left alone.
+        most: Bytes of all files; three quarters are left where there are more.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            found = [(entry.path, entry.stat()) for entry in entries if entry.is_file()]
+        total = sum(status.st_size for _, status in found)
+        left = total if total <= most else most * 3 // 4
+        for path, status in sorted(found, key=lambda one: max(one[1].st_atime, one[1].st_mtime)):
+            if total <= left:
+                break
+            os.unlink(path)
+            total -= status.st_size
+    except OSError:  # another process is at it
+        return
 
 
 def spread_over_cores(batch: int) -> None:

@@ -43,7 +43,8 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import families
 
 COMMANDS = (
-    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view"
+    "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view",
+    "doctor",
 )  # fmt: skip
 
 
@@ -224,6 +225,10 @@ def chair(tmp_path_factory):
         (("--min-overlap", "-0.1"), "--min-overlap is -0.1"),
         (("--max-angle", "0"), "--max-angle is 0"),
         (("--max-distance", "inf"), "--max-distance is inf"),
+        (("--seed", "-1"), "--seed is -1; give a whole number, 0 or more"),
+        (("--depth-scale", "inf"), "The depth scale is inf"),
+        (("--depth-scale", "nan"), "The depth scale is nan"),
+        (("--click", "nan", "1"), "--click is nan 1.0"),
     ],
 )
 def test_options_of_a_scan_out_of_range_are_refused(scene, refused, tmp_path, options, said, prior):
@@ -237,6 +242,9 @@ def test_options_of_a_scan_out_of_range_are_refused(scene, refused, tmp_path, op
     [
         (("--iterations", "0"), "--iterations is 0"),
         (("--population", "2"), "--population is 2"),
+        (("--population", "1000000000"), "3 to 100000: each is a shape to decode"),
+        (("--iterations", "1000000000"), "--iterations is 1000000000"),
+        (("--seed", str(2**64)), "0 to 4294967295: random keys have 32 bits"),
         (("--sigma0", "0"), "--sigma0 is 0"),
         (("--sigma0", "nan"), "--sigma0 is nan"),
         (("--step-size", "-1"), "--step-size is -1"),
@@ -274,6 +282,8 @@ def test_a_search_of_ones_own_is_found_in_the_current_folder(refused, tmp_path, 
         (("--frames", "1,x"), "--frames is '1,x'"),
         (("--frames", "0"), "--frames is '0'"),
         (("--frames", "2,2"), "--frames is '2,2'"),
+        (("--frames", "1,1000000000"), "--frames is 1000000000; give a whole number, 1 to 180"),
+        (("--seed", str(2**64)), "0 to 4294967295"),
         (("--methods", "encoder,magic"), "no method 'magic'"),
         (("--up", "z"), "must be perpendicular"),
         (("--noise", "--no-noise"), "Give --noise or --no-noise, not both"),
@@ -353,7 +363,7 @@ def test_a_collection_of_meshes_that_cannot_be_trained_on_is_refused(chair, refu
 
 def test_a_missing_dataset_is_refused(refused, tmp_path):
     assert "There is no dataset" in refused("train", "--dataset", tmp_path / "nowhere")
-    assert "--chairs is 0" in refused("dataset", "--chairs", 0)
+    assert "--count is 0" in refused("dataset", "--count", 0)
     assert "--paths is 0" in refused("dataset", "--paths", 0)
     assert "--missing is -0.1" in refused("dataset", "--missing", -0.1)
     assert "--noisy is 1.5" in refused("dataset", "--noisy", 1.5)
@@ -777,7 +787,7 @@ def test_training_goes_on_from_the_weights_of_another(
 @pytest.mark.slow
 def test_from_dataset_to_training_to_reconstruction(run, chair, tmp_path):
     data, trained = tmp_path / "data", tmp_path / "train"
-    make = ("dataset", "--chairs", 4, "--frames", 1, 2, "--cameras", "paper", "--workers", 1,
+    make = ("dataset", "--count", 4, "--frames", 1, 2, "--cameras", "paper", "--workers", 1,
             "--output", data)  # fmt: skip
     learn = ("train", "--dataset", data, "--output", trained, "--steps", 2, "--batch", 2)
     few = ("--weights", trained / "weights.safetensors", "--iterations", 2)

@@ -13,8 +13,10 @@ import jaxshape
 
 ROOT = Path(jaxshape.__file__).parent
 
-BELOW_ALL = ("checks", "files", "process")
+ALONE = ("limits",)
 """Modules that import nothing of jaxshape."""
+
+BELOW_ALL = (*ALONE, "checks", "reading", "files", "process", "claim")
 
 PACKAGES = ("geometry", "data", "model", "search", "mapping", "results", "report", "cli")
 ROOMS = ("config", "segmentation", "tracking", "placement", "map")
@@ -55,7 +57,7 @@ def against_the_way(source: str, module: str, package: str) -> list[str]:
         own = place(module, prefix, order) if module != prefix else None
         if own is not None:
             wrong += [name for name in names if (place(name, prefix, order) or 0) > own]
-    if module.removeprefix("jaxshape.") in BELOW_ALL:
+    if module.removeprefix("jaxshape.") in ALONE:
         wrong += [name for name in names if name.split(".")[0] == "jaxshape"]
     return wrong
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from jaxshape import process
-from jaxshape.process import keep_compiled, processor
+from jaxshape.process import bound_folder, keep_compiled, processor
 
 FOLDER, SMALLEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
@@ -46,6 +46,19 @@ def test_the_second_process_finds_what_the_first_compiled(environment, tmp_path)
     assert hits() == 0
     assert hits() > 0
     assert (tmp_path / "jaxshape/compiled").stat().st_mode & 0o077 == 0
+
+
+def test_the_folder_of_compiled_programs_is_bounded(tmp_path):
+    """Those used longest ago go first; folders stay."""
+    (tmp_path / "folder").mkdir()
+    for age in range(8):
+        (tmp_path / str(age)).write_bytes(bytes(100))
+        os.utime(tmp_path / str(age), (10**9 - age, 10**9 - age))
+    bound_folder(tmp_path, 800)
+    assert len(list(tmp_path.iterdir())) == 9
+    bound_folder(tmp_path, 799)
+    assert sorted(os.listdir(tmp_path)) == ["0", "1", "2", "3", "4", "folder"]
+    bound_folder(tmp_path / "nowhere", 1)
 
 
 def test_the_folder_of_the_user_wins(environment, tmp_path):

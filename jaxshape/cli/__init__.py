@@ -12,19 +12,26 @@ leaves earlier output as it was. JAX, and all that needs it, is imported inside 
     learning   dataset, train
     scoring    evaluate, plot
     viewing    view
+    doctor     doctor
 """
 
+import io
+import os
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
 from rich.markup import escape
 from tyro.conf import subcommand
 
-from jaxshape.cli.common import console
+from jaxshape.claim import Output, claimed
+from jaxshape.cli.common import console, warn
 from jaxshape.cli.completing import Complete
+from jaxshape.cli.doctor import Doctor
 from jaxshape.cli.inspecting import Inspect
 from jaxshape.cli.learning import BuildDataset, Train, preset_in
 from jaxshape.cli.options import RefusedSetting, refusing, reworded
@@ -33,8 +40,9 @@ from jaxshape.cli.recording import Reconstruct
 from jaxshape.cli.scoring import Evaluate, Plot
 from jaxshape.cli.viewing import ViewResult
 from jaxshape.data.config import DATASETS
+from jaxshape.files import OutputError
 from jaxshape.model.config import PRESETS
-from jaxshape.process import prepare_process
+from jaxshape.process import Terminated, prepare_process
 
 
 def commands(arguments: Sequence[str]) -> Any:
@@ -52,23 +60,48 @@ def commands(arguments: Sequence[str]) -> Any:
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]
         | Annotated[ViewResult, subcommand("view")]
+        | Annotated[Doctor, subcommand("doctor")]
     )
 
 
 def main() -> None:
     """Run the command line; the entry point of the console script."""
     sys.path.append("")  # the current folder may hold a search of the user's own
-    warnings.showwarning = lambda message, *_, **__: console.print(f"[yellow]warning[/] {message}")
-    table = commands(sys.argv[1:])
+    warnings.showwarning = lambda message, *_, **__: warn(str(message))
+    for stream in (sys.stdout, sys.stderr):  # names of files may be in no encoding
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    if sys.argv[1:] == ["--version"]:
+        print(f"jaxshape {version('jaxshape')}")
+        return
+    table, output = commands(sys.argv[1:]), None
     try:
         command = tyro.cli(table, prog="jaxshape", registry=refusing())
         prepare_process()
-        command.run()
-    except (RefusedSetting, ValueError, OSError) as problem:
+        asked = getattr(command, "writes", None)
+        with nullcontext() if asked is None else claimed(asked):
+            output = asked
+            command.run()
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever reads the answer has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except (RefusedSetting, ValueError, OSError, MemoryError) as problem:
         # Sentences for the user, by the convention of the package; anything else is a bug.
-        said = reworded(problem) if isinstance(problem, ValueError) else str(problem)
-        console.print(f"[red]jaxshape:[/] {escape(said)}", soft_wrap=True)
+        console.print(f"[red]jaxshape:[/] {escape(_sentence(problem, output))}", soft_wrap=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        console.print("stopped")
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        kept = "" if output is None else f". {output.kept}"
+        console.print(f"stopped{kept}", soft_wrap=True)
+        sys.exit(143 if isinstance(stop, Terminated) else 130)
+
+
+def _sentence(problem: Exception, output: Output | None) -> str:
+    """What went wrong, and what is left."""
+    if isinstance(problem, MemoryError):
+        return "The memory of this machine does not suffice."
+    if isinstance(problem, OutputError):
+        return str(problem) if output is None else f"{problem} {output.kept}"
+    if isinstance(problem, OSError) and problem.strerror and problem.filename:
+        return f"{str(problem.filename)!r} cannot be read or written: {problem.strerror.lower()}."
+    return reworded(problem) if isinstance(problem, ValueError) else str(problem)

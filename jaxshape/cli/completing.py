@@ -7,6 +7,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from jaxshape.claim import Output
 from jaxshape.cli.common import console, require, warn
 from jaxshape.cli.rebuild import Rebuild, report_objective, written
 from jaxshape.data.config import Axis
@@ -38,6 +39,11 @@ class Complete(Rebuild):
     """Folder for mesh.glb (in metres), mesh.ply (in the frame and the unit of the file), grid.npz,
     result.json, overview.png and report.html."""
 
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output)
+
     def run(self) -> None:
         start = time.perf_counter()
         import numpy as np
@@ -48,7 +54,6 @@ class Complete(Rebuild):
         from jaxshape.results.output import Observation
         from jaxshape.search.reconstruction import require_measured
 
-        require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
         cloud = read_cloud(self.scan, seed=self.seed)
         if self.sensor is not None:
             require(bool(np.isfinite(self.sensor).all()), "--sensor is not finite; give x y z.")

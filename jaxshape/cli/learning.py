@@ -12,6 +12,8 @@ from typing import Any, Literal
 
 import tyro
 
+from jaxshape import checks, limits
+from jaxshape.claim import Output
 from jaxshape.cli.collection import (
     SAMPLE,
     check_axes,
@@ -23,7 +25,7 @@ from jaxshape.cli.collection import (
 from jaxshape.cli.common import console, progress_bar, report_notes, report_skipped, require
 from jaxshape.cli.options import Axes, AxesName, Machines
 from jaxshape.cli.scoring import score
-from jaxshape.data.config import DatasetConfig
+from jaxshape.data.config import DatasetConfig, FamilyName
 from jaxshape.files import write_json, write_text
 from jaxshape.model.config import TrainConfig
 from jaxshape.process import spread_over_cores
@@ -44,18 +46,22 @@ class BuildDataset:
 
     Examples: jaxshape dataset --output data/chairs
 
+    jaxshape dataset --family table --count 2000
+
     jaxshape dataset --output data/mugs --meshes mugs/ --up z --front -y
 
     jaxshape dataset --output data/paper --preset paper
     """
 
     output: Path | None = None
-    """Folder of the dataset; data/chairs, or data/NAME of --meshes NAME, where not given. A build
-    that was killed goes on when asked for again."""
-    chairs: int = 8000
-    """Procedural chairs to make, unless --meshes is given."""
+    """Folder of the dataset; data/chairs or data/tables, or data/NAME of --meshes NAME, where not
+    given. A build that was killed goes on when asked for again."""
+    family: FamilyName = "chair"
+    """Procedural objects to make, unless --meshes is given."""
+    count: int = 8000
+    """How many of them."""
     meshes: Path | None = None
-    """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural chairs."""
+    """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural objects."""
     preset: Preset = "default"
     """Defaults of the options below: the best that we found, or the paper's 18 clean single views,
     which `jaxshape dataset --preset paper --help` shows."""
@@ -64,16 +70,30 @@ class BuildDataset:
     each seat upright and forward."""
     config: tyro.conf.OmitArgPrefixes[DatasetConfig] = DatasetConfig()
     workers: int = PROCESSORS
-    """Processes that work at the same time, 1 or more."""
+    """Processes that work at the same time, 1 to 256."""
+
+    def __post_init__(self) -> None:
+        checks.whole("workers", self.workers, 1, limits.WORKERS, "each takes 0.3 GB")
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the dataset."""
+        name = self.meshes.stem if self.meshes else f"{self.family}s"
+        return self.output or Path("data") / name
+
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.folder, goes_on=True)
 
     def run(self) -> None:
-        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.families import TEST_SEEDS, procedural_objects
 
-        require(1 <= self.chairs <= TEST_SEEDS, f"--chairs is {self.chairs}; give 1 to 1000000.")
-        require(self.workers >= 1, f"--workers is {self.workers}; give 1 or more.")
-        objects: Sequence[Any] = self.find(self.meshes) if self.meshes else range(self.chairs)
-        output = self.output or Path("data") / (self.meshes.stem if self.meshes else "chairs")
-        build(output, objects, self.config, self.workers)
+        require(1 <= self.count <= TEST_SEEDS, f"--count is {self.count}; give 1 to 1000000.")
+        objects: Sequence[Any] = (
+            self.find(self.meshes) if self.meshes else procedural_objects(self.family, self.count)
+        )
+        build(self.folder, objects, self.config, self.workers)
 
     def find(self, meshes: Path) -> Sequence[Any]:
         """The meshes, of which some are looked at for their unit and their axes."""
@@ -157,6 +177,16 @@ class Train:
     config: tyro.conf.OmitArgPrefixes[tyro.conf.AvoidSubcommands[TrainConfig]] = TrainConfig()
     machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the run."""
+        return self.output or Path("out") / self.name
+
+    @property
+    def writes(self) -> Output | None:
+        """What is written; None with several processes, of which the first writes."""
+        return None if self.machines.asked else Output(self.folder, goes_on=True)
+
     def run(self) -> None:
         if not self.machines.asked:
             spread_over_cores(self.config.batch)
@@ -172,7 +202,7 @@ class Train:
             f"--name is {self.name!r}; give a plain name, such as mug.",
         )
         self.machines.join()
-        output = self.output or Path("out") / self.name
+        output = self.folder
         start = load_prior(self.start) if self.start else None
         folder, held_out = self.dataset, None
         if folder is None:

@@ -7,9 +7,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxshape.cli.common import console, require
+from jaxshape import checks, limits
+from jaxshape.claim import Output
+from jaxshape.cli.common import console
 from jaxshape.cli.options import Seen
 from jaxshape.data.camera_config import CameraConfig
+from jaxshape.data.config import FamilyName
 from jaxshape.geometry.config import FusionName
 from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.names import families
@@ -39,6 +42,9 @@ class Rebuild:
     """Weights to use instead of those that come with the package."""
     seed: int = 0
     """Seed of all random numbers, 0 or more."""
+
+    def __post_init__(self) -> None:
+        checks.seed("seed", self.seed)
 
     def prepare(self) -> tuple[Any, Any, RefineConfig]:
         """The prior, the search and its settings, so that bad options are refused before work."""
@@ -115,37 +121,47 @@ def report_objective(result: dict[str, Any]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Rebuild):
-    """Rebuild a procedural chair nobody trained on from frames like a Kinect's along an orbit, and
+    """Rebuild a procedural object nobody trained on from frames like a Kinect's along an orbit, and
     compare with the truth.
 
     Examples: jaxshape demo --seed 3
 
-    jaxshape demo --camera iphone-lidar --frames 12
+    jaxshape demo --family table --camera iphone-lidar --frames 12
 
     jaxshape demo --camera paper --no-symmetry --objective paper
     """
 
+    family: FamilyName = "chair"
+    """Class of the object, and of the weights where none are given."""
     frames: int = 6
-    """Depth frames along the orbit, 20 degrees apart, 1 or more."""
+    """Depth frames along the orbit, 20 degrees apart, 1 to 180: ten times around."""
     seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     output: Path = Path("out/demo")
     """Folder for mesh.glb, mesh.ply, grid.npz, trace.npz, result.json, overview.png and
     report.html."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.whole("frames", self.frames, 1, limits.FRAMES, "that is ten times around")
+
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output)
+
     def run(self) -> None:
         start = time.perf_counter()
-        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.families import TEST_SEEDS, Procedural
         from jaxshape.search.reconstruction import require_measured
 
-        require(self.frames >= 1, f"--frames is {self.frames}; give 1 or more.")
-        require(self.seed >= 0, f"--seed is {self.seed}; give a number that is not negative.")
         seen = self.seen.config()
         prior, refiner, config = self.prepare()
-        with console.status("filming a chair"):
-            grids, observation = self.film(seen, prior.resolution)
+        with console.status(f"filming a {self.family}"):
+            shown = Procedural(self.family, TEST_SEEDS + self.seed)
+            grids, observation = self.film(shown.make(), seen, prior.resolution)
         require_measured(observation.occupied)
         found = self.searched(prior, refiner, config, grids)
-        figures = {"object": f"procedural chair {TEST_SEEDS + self.seed}", "frames": self.frames}
+        figures = {"object": f"procedural {self.family} {shown.seed}", "frames": self.frames}
         figures |= {"camera": seen.camera, "noise": seen.is_noisy, "fusion": seen.fused_by}
         figures |= self.settings(prior, seen.fused_by)
         figures |= {"seconds": round(time.perf_counter() - start, 2)}
@@ -157,21 +173,19 @@ class Demo(Rebuild):
             f"refined {result['iou_refined']:.3f}, composed {result['iou_composed']:.3f}"
         )
 
-    def film(self, seen: CameraConfig, resolution: int) -> tuple[Any, Any]:
-        """F and M of the chair (`Grids`), and what there is to show of it (`Observation`)."""
+    def film(self, mesh: Any, seen: CameraConfig, resolution: int) -> tuple[Any, Any]:
+        """F and M of the mesh (`Grids`), and what there is to show of it (`Observation`)."""
         import jax
         import numpy as np
 
         from jaxshape.data.capture import camera_distance, capture, fused_frames, sensor_of
-        from jaxshape.data.chairs import random_chair
-        from jaxshape.data.dataset import TEST_SEEDS
         from jaxshape.data.virtual_cameras import virtual_camera
         from jaxshape.geometry import camera
         from jaxshape.geometry.fusing import fusion_named
         from jaxshape.geometry.grids import binary
         from jaxshape.results.output import Observation
 
-        device, mesh = virtual_camera(seen.camera), random_chair(TEST_SEEDS + self.seed)
+        device = virtual_camera(seen.camera)
         distance = camera_distance(mesh, device)
         captured = capture(
             mesh,

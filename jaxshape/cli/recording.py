@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional
 
+from jaxshape.claim import Output
 from jaxshape.cli.common import console, progress_bar, require, warn
 from jaxshape.cli.inspecting import ConventionName
 from jaxshape.cli.rebuild import Rebuild, draw, report_objective
@@ -68,6 +69,11 @@ class Reconstruct(Rebuild):
     output: Path = Path("out/reconstruct")
     """Folder for mesh.glb, mesh.ply, grid.npz, trajectory.txt, keyframes.json, result.json,
     report.html and more."""
+
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output, goes_on=True)
 
     def run(self) -> None:
         start = time.perf_counter()
@@ -138,9 +144,9 @@ class Reconstruct(Rebuild):
                 )
         else:
             found = earlier.start
-            console.print(f"going on after frame {earlier.logs[-1].name}")
+            console.print(f"going on after frame {earlier.logs[-1].name}", markup=False)
         for note in found.notes:
-            console.print(note, highlight=False)
+            console.print(note, highlight=False, markup=False)
         chosen = range(found.index, len(sequence), self.every)
         progress, next_write = earlier, time.perf_counter() + _SECONDS_BETWEEN_WRITES
         with progress_bar("frames") as bar:
@@ -242,7 +248,8 @@ class Reconstruct(Rebuild):
         )
         for log in progress.logs:
             if log.status in ("lost", "unreadable"):
-                console.print(f"{log.name}: {log.status}, {log.reason}", highlight=False)
+                said = f"{log.name}: {log.status}, {log.reason}"
+                console.print(said, highlight=False, markup=False, soft_wrap=True)
         report_objective(result)
         print(verdict_in_words(result))
         print(f"wrote mesh.glb, trajectory.txt, result.json, report.html and more to {self.output}")

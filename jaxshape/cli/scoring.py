@@ -11,9 +11,11 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
+from jaxshape.claim import Output
 from jaxshape.cli.collection import check_axes, find_meshes, load_models, turned
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Seen, checked_numbers
+from jaxshape.data.config import FamilyName
 from jaxshape.files import write_json
 from jaxshape.search.config import RefineConfig
 
@@ -31,8 +33,10 @@ class Evaluate:
     meshes: Path | None = None
     """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
-    chairs: int = 0
-    """Number of procedural test chairs to use instead of --meshes."""
+    family: FamilyName = "chair"
+    """Class of the procedural objects, and of the weights where none are given."""
+    count: int = 0
+    """Number of procedural test objects to use instead of --meshes."""
     frames: str = "1,4,8,18"
     """Numbers of frames to fuse, separated by commas: the first k of an orbit, 20 degrees apart."""
     methods: str = "encoder,gradient,cma"
@@ -46,8 +50,13 @@ class Evaluate:
     seed: int = 0
     """Seed of noise, surface samples and searches, 0 or more."""
 
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output, is_file=True, goes_on=True)
+
     def run(self) -> None:
-        from jaxshape.data.dataset import TEST_SEEDS
+        from jaxshape.data.families import TEST_SEEDS, procedural_objects
         from jaxshape.data.meshes import lying_on_its_side
         from jaxshape.model.weights import load_prior
         from jaxshape.results import evaluation
@@ -61,26 +70,25 @@ class Evaluate:
             seed=self.seed,
         )
         require(
-            (self.meshes is None) != (self.chairs == 0) and self.chairs >= 0,
-            "Give either --meshes PATH or --chairs NUMBER, to say what to evaluate on.",
+            (self.meshes is None) != (self.count == 0) and 0 <= self.count <= TEST_SEEDS,
+            "Give either --meshes PATH or --count NUMBER, to say what to evaluate on.",
         )
-        test_seeds = range(TEST_SEEDS, TEST_SEEDS + self.chairs)
-        sources: Any = find_meshes(self.meshes) if self.meshes else test_seeds
-        prior = load_prior(self.weights)
+        procedural = procedural_objects(self.family, self.count, TEST_SEEDS)
+        sources: Any = find_meshes(self.meshes) if self.meshes else procedural
+        prior = load_prior(self.weights or self.family)
         evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
-        known = prior if self.weights else None
         if self.meshes:
-            sources = turned(sources, self.axes, known)
+            sources = turned(sources, self.axes, prior)
         models, skipped = load_models(sources, self.axes)
-        if self.meshes:
+        if self.meshes and self.family == "chair":
             lying = [model.name for model in models if lying_on_its_side(model.mesh)]
             usable = {model.name for model in models}
-            sources = [source for source in sources if source.name in usable]
-            check_axes(sources, lying, self.axes, prior=known, refuse=self.weights is None)
+            kept = [source for source in sources if source.name in usable]
+            check_axes(kept, lying, self.axes, prior=prior, refuse=self.weights is None)
         about = {
-            "meshes": str(self.meshes) if self.meshes else f"{self.chairs} procedural chairs",
+            "meshes": str(self.meshes or f"{self.count} procedural {self.family}s"),
             **asdict(self.axes),
-            "weights": str(self.weights) if self.weights else "chair (packaged)",
+            "weights": str(self.weights) if self.weights else f"{self.family} (packaged)",
         }
         score(self.output, prior, config, about, models, skipped)
 
@@ -166,6 +174,11 @@ class Plot:
     """Folders made by `jaxshape reconstruct` or `jaxshape demo`; several are compared."""
     output: Path | None = None
     """Picture to write, .png, .svg or .pdf; trace.png in the (first) folder by default."""
+
+    @property
+    def writes(self) -> Output | None:
+        """What is written; None where that is in the folder of a result, which has to be there."""
+        return None if self.output is None else Output(self.output, is_file=True)
 
     def run(self) -> None:
         from jaxshape.report.plots import compare_searches, plot_search

@@ -16,6 +16,8 @@ from typing import NamedTuple
 
 from trimesh.resolvers import Resolver
 
+from jaxshape.limits import MESH_BYTES
+
 MESH_SUFFIXES = (".obj", ".off", ".ply", ".glb", ".gltf", ".stl")
 ARCHIVE_SUFFIXES = (".zip", ".sh3f")
 
@@ -26,7 +28,7 @@ UNREAD_SUFFIXES = (
 )  # fmt: skip
 """Suffixes of meshes and archives that are not read, and are counted where they are met."""
 
-MAX_BYTES = 512 * 2**20
+MAX_BYTES = MESH_BYTES
 """Largest file or inflated archive member that is read."""
 
 _SUFFIX = "|".join(map(re.escape, MESH_SUFFIXES + ARCHIVE_SUFFIXES))

@@ -1,6 +1,5 @@
 """The oriented box that tells the object from the room."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxshape import limits, reading
 from jaxshape.data.sequences import SequenceError, check_rigid
 
 
@@ -65,7 +65,7 @@ def read_box(path: str | Path) -> Box:
         SequenceError: The file cannot be read, or is none of these.
     """
     try:
-        content = json.loads(Path(path).read_text())
+        content = reading.read_json(path)
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} cannot be read as JSON ({error}); expected an object box: write "
@@ -75,10 +75,11 @@ def read_box(path: str | Path) -> Box:
         raise SequenceError(f"{path} holds a JSON {type(content).__name__}; expected an object.")
     box = _level_box(content, path) if "world_to_level" in content else _oriented_box(content, path)
     check_rigid(box.T_world_object, path)
-    if not (np.isfinite(box.size).all() and (box.size > 0).all()):
+    low, high = limits.BOX_SIZE
+    if not ((low <= box.size) & (box.size <= high)).all():
         raise SequenceError(
-            f"{path} gives the size {box.size.tolist()}; expected positive extents in metres: "
-            "give each axis from lowest to highest."
+            f"{path} gives the size {box.size.tolist()}; expected positive extents, {low:g} to "
+            f"{high:g} m: give each axis from lowest to highest, in metres."
         )
     return box
 
@@ -91,6 +92,8 @@ def _oriented_box(content: dict[str, Any], path: str | Path) -> Box:
             'write [{"min": [x, y, z], "max": [x, y, z]}].'
         )
     exclude = [[_numbers(one, end, (3,), path) for end in ("min", "max")] for one in excluded]
+    if any((low > high).any() for low, high in exclude):
+        raise SequenceError(f"{path} excludes boxes whose min is above their max: exchange them.")
     return Box(
         T_world_object=_numbers(content, "T_world_object", (4, 4), path),
         size=_numbers(content, "size", (3,), path),
@@ -99,8 +102,10 @@ def _oriented_box(content: dict[str, Any], path: str | Path) -> Box:
 
 
 def _level_box(content: dict[str, Any], path: str | Path) -> Box:
-    T_level_world = _numbers(content, "world_to_level", (4, 4), path)
-    level = content.get("chair_box_level", {})
+    T_level_world = _level_frame(content, path)
+    level = content.get("chair_box_level")
+    if not isinstance(level, dict):
+        raise SequenceError(f"{path} gives {level!r:.60} as chair_box_level; write X, Y and h.")
     x, y, height = (_numbers(level, axis, (2,), path) for axis in ("X", "Y", "h"))
     front, _, up = T_level_world[:3, :3]
     T_world_object = np.eye(4)
@@ -119,12 +124,22 @@ def _level_box(content: dict[str, Any], path: str | Path) -> Box:
     return Box(T_world_object, size, np.sort(corners, axis=0)[None])
 
 
+def _level_frame(content: dict[str, Any], path: str | Path) -> Float[np.ndarray, "4 4"]:
+    """World to level, a rigid motion that may mirror, as that of the known files does."""
+    T = _numbers(content, "world_to_level", (4, 4), path)
+    mirrored = np.diag([1.0, 1.0, np.sign(np.linalg.det(T[:3, :3])) or 1.0, 1.0])
+    check_rigid(mirrored @ T, f"world_to_level of {path}")
+    return T
+
+
 _FAR = 1e6
 _COMPARISON = re.compile(r"\s*([XYh])\s*([<>])\s*(-?\d+(?:\.\d+)?)\s*")
 
 
 def _level_rule(rule: str, path: str | Path) -> Float[np.ndarray, "2 3"]:
     """The corners, in the level frame, of what a rule like `X > -0.96 and h > 0.62` excludes."""
+    if len(rule) > limits.PATH_LENGTH:
+        raise SequenceError(f"{path} gives {len(rule)} characters as exclude_level; shorten it.")
     corners = np.array([[-_FAR] * 3, [_FAR] * 3])
     for part in re.sub(r"\(.*?\)", "", rule).split(" and "):
         comparison = _COMPARISON.fullmatch(part)
@@ -142,12 +157,13 @@ def _numbers(
     content: dict[str, Any], key: str, shape: tuple[int, ...], path: str | Path
 ) -> Float[np.ndarray, "..."]:
     try:
-        numbers = np.array(content[key], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
+        given = content.get(key, [])
+        numbers = reading.numbers_of(given, np.shape(given))
+    except ValueError:
         numbers = np.zeros(0)
-    if numbers.shape != shape:
+    if numbers.shape != shape or not (np.abs(numbers) <= limits.FAR).all():
         raise SequenceError(
-            f"{path} gives {content.get(key)} as {key}; expected numbers of shape {shape}: "
-            "see jaxshape.data.boxes.read_box."
+            f"{path} gives {content.get(key)!r:.200} as {key}; expected numbers of shape {shape} "
+            f"in metres, {limits.FAR:g} at most: see jaxshape.data.boxes.read_box."
         )
     return numbers

@@ -71,7 +71,7 @@ class Record(NamedTuple):
 
     Attributes:
         name: Its name.
-        content: Digest of its file; empty for a procedural chair.
+        content: Digest of its file; empty for a procedural object.
         notes: What its file held besides.
         skipped: Why it could not be used; None where it could.
     """
@@ -95,7 +95,7 @@ def build_dataset(
 
     Args:
         folder: Folder of the dataset; made if missing.
-        objects: Seeds of procedural chairs, or meshes.
+        objects: Procedural objects, or meshes.
         config: Settings of the dataset.
         workers: Processes, 1 or more; None for one for each CPU core.
 
@@ -156,7 +156,7 @@ def content_of(item: Object) -> str:
 
 
 def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> None:
-    names = [item.name if isinstance(item, MeshSource) else str(item) for item in objects]
+    names = [item.name for item in objects]
     digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
     settings = json.loads(json.dumps(asdict(config)))
     claim = {"format": FORMAT, "config": settings, "objects": len(names), "names_sha256": digest}
@@ -164,8 +164,9 @@ def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> No
     if not path.exists():
         return write_json(path, claim)
     found = json.loads(path.read_text())
-    earlier = {"unit": "m"}  # datasets of before there were units
-    if found | {"config": earlier | found.get("config", {})} != claim:
+    # Datasets of before there was a setting have what is its default now.
+    known = {"config": json.loads(json.dumps(asdict(DatasetConfig()))) | found.get("config", {})}
+    if found | known != claim:
         raise DatasetError(
             f"{str(folder)!r} already holds a dataset of other objects or settings; "
             "give another folder, or remove this one."
@@ -194,8 +195,8 @@ def _make_part(folder: Path, config: DatasetConfig, numbered: tuple[int, Object]
 
 
 def _skip(folder: Path, number: int, item: Object, reason: str, detail: str) -> None:
-    name = item.name if isinstance(item, MeshSource) else f"chair-{item}"
-    _write_part(folder, number, Record(name, content_of(item), (), Skipped(name, reason, detail)))
+    skipped = Skipped(item.name, reason, detail)
+    _write_part(folder, number, Record(item.name, content_of(item), (), skipped))
 
 
 def _write_part(folder: Path, number: int, record: Record) -> None:

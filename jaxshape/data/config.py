@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, get_args
 
-from jaxshape import checks
+from jaxshape import checks, limits
 
 CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]
 """Depth cameras that a virtual one can stand for (`data/virtual_cameras`)."""
+
+FamilyName = Literal["chair", "table"]
+"""Families of procedural objects (`data/families`), and weights of the same names."""
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
@@ -114,9 +117,11 @@ class DatasetConfig:
 
     def __post_init__(self) -> None:
         checks.one_of("resolution", self.resolution, (8, 16, 32, 64, 128))
-        checks.whole("paths", self.paths, 1)
+        checks.whole("paths", self.paths, 1, limits.PATHS, "each is filmed anew")
         if not self.frames or self.frames[0] < 1 or any(a >= b for a, b in pairwise(self.frames)):
             checks.refuse("frames", self.frames, "increasing numbers of frames, 1 or more each")
+        why = "all frames of a path are in memory together"
+        checks.whole("frames", self.frames[-1], 1, limits.FRAMES, why)
         if not self.cameras:
             checks.refuse("cameras", self.cameras, "one name of a camera or more")
         for name in self.cameras:
@@ -125,7 +130,7 @@ class DatasetConfig:
         checks.within("arcs", self.arcs, 0, 1)
         check_axes(self.up, self.front)
         checks.one_of("unit", self.unit, UNITS)
-        checks.whole("seed", self.seed, 0)
+        checks.seed("seed", self.seed)
 
 
 DATASETS = {

@@ -21,8 +21,8 @@ from jaxtyping import Bool, UInt8
 
 from jaxshape.data import meshes
 from jaxshape.data.archives import MeshSource
-from jaxshape.data.chairs import random_chair
 from jaxshape.data.config import DatasetConfig, UnitName
+from jaxshape.data.families import Procedural
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.data.paths import draw_path
 from jaxshape.geometry.grids import Grids
@@ -40,11 +40,8 @@ STEPS = 15
 ATTEMPTS = 3
 """How often a path is drawn along which nothing is measured."""
 
-TEST_SEEDS = 1_000_000
-"""Procedural chairs from this seed on are for tests; training uses smaller ones."""
-
-Object = int | MeshSource
-"""An object of a dataset: the seed of a procedural chair, or a mesh file."""
+Object = Procedural | MeshSource
+"""An object of a dataset: a procedural one, or a mesh file."""
 
 
 class DatasetError(ValueError):
@@ -60,7 +57,7 @@ def load_object(
     """Make or read one object in the canonical frame."""
     if isinstance(item, MeshSource):
         return meshes.load(item, up=up, front=front, unit=unit)
-    return Model(f"chair-{item}", random_chair(item), {})
+    return Model(item.name, item.make(), {})
 
 
 def object_paths(

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-MAX_POINTS = 100_000_000
-"""Most points of a file."""
+from jaxshape import limits
 
 _ENTRIES = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 _KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -37,8 +36,8 @@ def parse_pcd(content: bytes) -> Columns:
     header, body = _header(content)
     names, kinds, counts = header["FIELDS"], _kinds(header), _counts(header)
     count = int(header.get("POINTS", header["WIDTH"])[0])
-    if not 0 <= count <= MAX_POINTS:
-        raise ValueError(f"it holds {count} points; expected 0 to {MAX_POINTS}")
+    if not 0 <= count <= limits.CLOUD_POINTS:
+        raise ValueError(f"it holds {count} points; expected 0 to {limits.CLOUD_POINTS}")
     row = np.dtype(
         [(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))]
     )
@@ -96,6 +95,8 @@ def _counts(header: dict[str, list[str]]) -> list[int]:
 
 
 def _ascii(body: bytes, counts: list[int], count: int) -> list[np.ndarray]:
+    if len(body) > limits.CLOUD_TEXT_BYTES:
+        raise ValueError("it has too many points for a text; save it as binary")
     table = np.array(body.split(), dtype=np.float64)
     width = sum(counts)
     if len(table) != width * count:
@@ -118,7 +119,7 @@ def _by_columns(content: bytes, row: np.dtype, count: int) -> list[np.ndarray]:
 def _unpacked(body: bytes, size: int) -> bytes:
     """The content of a block: its packed and its real size, then LZF's runs and references."""
     packed, real = np.frombuffer(body, "<u4", 2)
-    if real != size:
+    if real != size or size > limits.MESH_BYTES:
         raise ValueError(f"its block holds {real} bytes; expected {size}")
     source, out, i = memoryview(body)[8 : 8 + int(packed)], bytearray(), 0
     while i < len(source) and len(out) <= size:

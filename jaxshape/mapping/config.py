@@ -6,7 +6,7 @@ Nothing here imports JAX, so that the command line answers at once.
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from jaxshape import checks
+from jaxshape import checks, limits
 from jaxshape.geometry.config import FusionName
 
 
@@ -91,4 +91,4 @@ class MappingConfig:
         checks.one_of("fusion", self.fusion, get_args(FusionName))
         checks.positive("depth_noise", self.depth_noise, "metres")
         checks.whole("min_hits", self.min_hits, 1)
-        checks.whole("keyframe_iterations", self.keyframe_iterations, 1)
+        checks.whole("keyframe_iterations", self.keyframe_iterations, 1, limits.STEPS)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Shaped
 
 from jaxshape.geometry.grids import Grids, binary
 from jaxshape.model.config import Architecture
@@ -54,16 +54,16 @@ class AutoEncoder(nn.Module):
 
     def __call__(
         self,
-        grid: Bool[Array, "b x y z"] | Float[Array, "b x y z"],
+        seen: Shaped[Array, "b x y z c"],
         train: bool,
         noise: Float[Array, "b d"] | float = 0.0,
     ) -> tuple[Float[Array, "b x y z"], Float[Array, "b d"]]:
         """Logits of the completed grid, and its code, to which noise was added before decoding."""
-        code = self.encoder(grid, train)
+        code = self.encoder(seen, train)
         return self.decoder(code + noise, train), code
 
-    def encode(self, grid: Float[Array, "b x y z"], train: bool = False) -> Float[Array, "b d"]:
-        return self.encoder(grid, train)
+    def encode(self, seen: Float[Array, "b x y z c"], train: bool = False) -> Float[Array, "b d"]:
+        return self.encoder(seen, train)
 
     def decode(self, code: Float[Array, "b d"], train: bool = False) -> Float[Array, "b x y z"]:
         return self.decoder(code, train)
@@ -80,8 +80,8 @@ class Encoder(nn.Module):
     axis: str | None
 
     @nn.compact
-    def __call__(self, grid, train):
-        x = grid[..., None].astype(self.dtype)
+    def __call__(self, seen, train):
+        x = seen.astype(self.dtype)
         for i, channels in enumerate(self.architecture.encoder):
             x = downsample(x, _kernel(self, f"conv{i}", x.shape[-1], channels).astype(self.dtype))
             x = _normalize(x, train, self.axis, f"norm{i}")
@@ -142,9 +142,20 @@ def initialize(key: PRNGKeyArray, architecture: Architecture = Architecture()) -
         key: Random key of the first weights.
         architecture: Sizes of the network.
     """
-    grid = jnp.zeros((1, *[architecture.resolution] * 3), jnp.float32)
+    seen = jnp.zeros((1, *[architecture.resolution] * 3, 1 + architecture.occlusion), jnp.float32)
     # Under jit the forward pass, which Flax traces to find the shapes, is left out.
-    return jax.jit(partial(AutoEncoder(architecture).init, train=False))(key, grid)
+    return jax.jit(partial(AutoEncoder(architecture).init, train=False))(key, seen)
+
+
+def seen_by_encoder(grids: Grids, occlusion: bool) -> Float[Array, "b x y z c"]:
+    """The encoder's input: F and M as they are, or F alone, rounded where it is soft (paper).
+
+    Args:
+        grids: F and M `[b x y z]`.
+        occlusion: Whether the encoder takes M too (`Architecture.occlusion`).
+    """
+    channels = (grids.occupied, grids.occluded) if occlusion else (binary(grids).occupied,)
+    return jnp.stack(channels, axis=-1).astype(jnp.float32)
 
 
 def architecture_of(params: PyTree) -> Architecture:
@@ -159,6 +170,7 @@ def architecture_of(params: PyTree) -> Architecture:
         encoder=tuple(encoder[f"conv{i}"].shape[-1] for i in range(depth)),
         decoder=tuple(decoder[f"conv{i}"].shape[-2] for i in range(depth - 1)),
         code=decoder["conv0"].shape[-1],
+        occlusion=encoder["conv0"].shape[-2] == 2,
     )
 
 
@@ -169,10 +181,10 @@ def shapes(params: PyTree) -> PyTree:
 
 
 def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
-    """The code of F, rounded where it is soft; the encoder does not use M."""
-    network = AutoEncoder(architecture_of(params))
-    F = binary(grids).occupied.astype(jnp.float32)
-    return jnp.asarray(network.apply(params, F, method="encode"))
+    """The code of F, or of F and M, as the sizes of the encoder say."""
+    architecture = architecture_of(params)
+    seen = seen_by_encoder(grids, architecture.occlusion)
+    return jnp.asarray(AutoEncoder(architecture).apply(params, seen, method="encode"))
 
 
 class PreparedDecoder(NamedTuple):

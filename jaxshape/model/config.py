@@ -6,7 +6,7 @@ Nothing here imports JAX, so that the command line answers at once.
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-from jaxshape import checks
+from jaxshape import checks, limits
 from jaxshape.data.config import InputConfig
 
 Optimizer = Literal["muon", "adam"]
@@ -27,6 +27,8 @@ class Architecture:
         decoder: Channels after each transposed convolution but the last, which has one channel: one
             entry fewer than `encoder`, each 1 or more.
         code: Numbers in a code, 2 or more (paper: 100).
+        occlusion: Give the encoder the occlusion mask M beside F, both soft. The paper's encoder
+            sees F alone, binary, and cannot tell free voxels from unknown ones.
 
     Raises:
         ValueError: The layers of encoder and decoder do not match, or a size is outside its range.
@@ -35,12 +37,13 @@ class Architecture:
     encoder: tuple[int, ...] = (32, 64, 128, 256)
     decoder: tuple[int, ...] = (128, 64, 32)
     code: int = 100
+    occlusion: bool = False
 
     def __post_init__(self) -> None:
+        checks.one_of("occlusion", self.occlusion, (True, False))
         for name in ("encoder", "decoder"):
-            if min(getattr(self, name), default=0) < 1:
-                checks.refuse(name, getattr(self, name), "numbers of channels, 1 or more each")
-        checks.whole("code", self.code, 2)
+            _check_channels(name, getattr(self, name))
+        checks.whole("code", self.code, 2, limits.CODE, "its covariance has the square")
         if len(self.encoder) != len(self.decoder) + 1:
             raise ValueError(
                 f"The encoder has {len(self.encoder)} layers and the decoder "
@@ -74,12 +77,18 @@ class Completion:
     resolution: int = 32
 
     def __post_init__(self) -> None:
-        if min(self.channels) < 1:
-            checks.refuse("channels", self.channels, "numbers of channels, 1 or more each")
-        checks.whole("depth", self.depth, 1)
-        checks.whole("code", self.code, 2)
-        if self.resolution < 8 or self.resolution % 8:
-            checks.refuse("resolution", self.resolution, "a multiple of 8")
+        _check_channels("channels", self.channels)
+        checks.whole("depth", self.depth, 1, limits.CHANNELS)
+        checks.whole("code", self.code, 2, limits.CODE, "its covariance has the square")
+        if not 8 <= self.resolution <= limits.RESOLUTION or self.resolution % 8:
+            checks.refuse(
+                "resolution", self.resolution, f"a multiple of 8, up to {limits.RESOLUTION}"
+            )
+
+
+def _check_channels(name: str, channels: tuple[int, ...]) -> None:
+    if not 1 <= min(channels, default=0) <= max(channels, default=0) <= limits.CHANNELS:
+        checks.refuse(name, channels, f"numbers of channels, 1 to {limits.CHANNELS} each")
 
 
 @dataclass(frozen=True)
@@ -145,8 +154,9 @@ class TrainConfig:
     def __post_init__(self) -> None:
         checks.one_of("optimizer", self.optimizer, get_args(Optimizer))
         checks.one_of("schedule", self.schedule, get_args(Schedule))
-        for name in ("steps", "batch", "report_every"):
-            checks.whole(name, getattr(self, name), 1)
+        for name in ("steps", "report_every"):
+            checks.whole(name, getattr(self, name), 1, limits.STEPS)
+        checks.whole("batch", self.batch, 1, limits.BATCH, "it is in memory as a whole")
         checks.within("average", self.average, 0, 1)
         checks.within("posterior_share", self.posterior_share, 0, 1)
         checks.whole("validation", self.validation, 0)
@@ -154,7 +164,7 @@ class TrainConfig:
             checks.positive(name, getattr(self, name))
         for name in ("code_noise", "code_weight"):
             checks.at_least(name, getattr(self, name), 0)
-        checks.whole("seed", self.seed, 0)
+        checks.seed("seed", self.seed)
 
 
 _AUTOENCODER = TrainConfig(Architecture(), average=0.0, occluded_weight=1.0, code_weight=0.0)

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from jaxshape.geometry.grids import Grids, binary
+from jaxshape.geometry.grids import Grids
 from jaxshape.model import autoencoder, completion
 from jaxshape.model.config import Architecture, Completion, TrainConfig
 from jaxshape.model.shapes import ShapeModel
@@ -97,7 +97,7 @@ def autoencoder_cost(variables, batch: Batch, noise, config: TrainConfig, axis) 
     network = autoencoder.AutoEncoder(config.architecture, dtype, axis)
     (logits, code), updates = network.apply(
         variables,
-        binary(batch.grids).occupied,
+        autoencoder.seen_by_encoder(batch.grids, config.architecture.occlusion),
         train=True,
         noise=config.code_noise * noise,
         mutable=["batch_stats"],

@@ -10,7 +10,7 @@ carries beside its parameters. `autoencoder` and `pca` are members; docs/example
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -105,12 +105,19 @@ class ShapePrior(NamedTuple):
 
 def resolution_of(model: ShapeModel, params: PyTree, code_size: int) -> int:
     """Voxels along each axis of the grids that a model decodes."""
+    leaves, structure = jax.tree.flatten(params)
+    kinds = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    return _resolution(model, structure, kinds, code_size)
 
+
+@lru_cache  # tracing a decoder takes a fifth of a second
+def _resolution(model: ShapeModel, structure: Any, kinds: tuple[Any, ...], code_size: int) -> int:
     def decoded(params):
         prepared = model.prepare(params, None, "float32")
         return model.decode(prepared, jnp.zeros((1, code_size)))
 
-    return jax.eval_shape(decoded, params).shape[-1]
+    shapes = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
+    return jax.eval_shape(decoded, jax.tree.unflatten(structure, shapes)).shape[-1]
 
 
 def encode(prior: ShapePrior, grids: Grids) -> Float[Array, "*batch d"]:

@@ -9,10 +9,11 @@ import json
 import os
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +25,10 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, Int, PyTree
 from optax.contrib import MuonDimensionNumbers, muon
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from jaxshape import limits, reading
 from jaxshape.data.dataset import Dataset
 from jaxshape.data.inputs import draw_pair
 from jaxshape.files import atomic_path, write_text
@@ -405,22 +407,43 @@ def _agreed_state(
 
 
 def _run_of(checkpoint: Path) -> str | None:
-    with safe_open(checkpoint, "np") as file:
+    with _opened(checkpoint) as file:
         return (file.metadata() or {}).get("run")
+
+
+@contextmanager
+def _opened(checkpoint: Path) -> Iterator[Any]:
+    """A checkpoint for the block that reads it; `ValueError` if it is damaged."""
+    try:
+        with reading.opened(checkpoint, limits.WEIGHT_BYTES), safe_open(checkpoint, "np") as file:
+            yield file
+    except (SafetensorError, OSError, ValueError) as problem:
+        raise ValueError(
+            f"{str(checkpoint)!r} cannot be gone on with ({problem}); remove it to begin anew."
+        ) from problem
 
 
 def _read_checkpoint(path: Path, config: TrainConfig) -> TrainState:
     template = jax.eval_shape(lambda: initial_state(config))
-    with safe_open(path, "np") as file:
+    with _opened(path) as file:
         leaves = [jnp.asarray(file.get_tensor(name)) for name in flatten(template)]
+        wanted = jax.tree.leaves(template)
+        if any(
+            x.shape != y.shape or x.dtype != y.dtype for x, y in zip(leaves, wanted, strict=True)
+        ):
+            raise ValueError("its arrays are of other shapes")
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
 def read_metrics(folder: str | os.PathLike[str]) -> list[Report]:
     """The reports of a run so far; none before the first."""
     path = Path(folder) / "metrics.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    return [Report(**json.loads(line)) for line in lines]
+    if not path.exists():
+        return []
+    try:
+        return [Report(**reading.parse_json(line)) for line in reading.read_text(path).splitlines()]
+    except (OSError, ValueError, TypeError) as problem:
+        raise ValueError(f"{str(path)!r} is damaged ({problem}); remove it.") from problem
 
 
 def _record(folder: Path, report: Report) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 from trimesh.visual import ColorVisuals
 
+from jaxshape.report.guard import guarded
 from jaxshape.report.paint import Paint, paints
 from jaxshape.report.palette import LAYERS
 from jaxshape.results.folder import (
@@ -50,7 +51,7 @@ class LiveView:
         self.folder = Path(folder)
         self.found = read_folder(self.folder)  # refuses what is no folder before a server is up
         _require_own(host)
-        with redirect_stdout(io.StringIO()):  # a banner
+        with redirect_stdout(io.StringIO()), guarded(host):  # a banner
             self.server = viser.ViserServer(host=host, port=port, label="jaxshape", verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self._stamps: dict[str, Any] = {}

@@ -6,13 +6,13 @@ It lies in `state.npz` of the result folder, and is removed when the run ends.
 import json
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
+from jaxshape import reading
 from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.files import atomic_path
@@ -70,8 +70,9 @@ def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> No
     for name in ("masked", "segmented"):
         pixels = np.stack([np.asarray(getattr(one, name)) for one in state.keyframes])
         arrays[f"keyframes.{name}"] = np.packbits(pixels, axis=-1)
-    if start.masked is not None:
-        arrays["masked"] = start.masked
+    for name in ("masked", "core"):
+        if getattr(start, name) is not None:
+            arrays[name] = getattr(start, name)
     if start.T_level_world is not None:
         arrays["T_level_world"] = start.T_level_world
     if start.placement is not None:
@@ -107,24 +108,33 @@ def load_state(
     if not path.is_file():
         return None
     try:
-        with np.load(path) as file:
-            kept = dict(file)
-        about = json.loads(str(kept["about"]))
-    except (OSError, EOFError, BadZipFile, ValueError, KeyError) as problem:
-        raise SequenceError(
-            f"{path} cannot be read ({problem}); remove it, or add --fresh to begin anew."
-        ) from problem
-    if about["settings"] != json.loads(json.dumps(settings)):
+        kept = reading.read_arrays(path)
+        about = reading.parse_json(str(kept["about"]))
+        is_ours = about["settings"] == json.loads(json.dumps(settings))
+    except (OSError, ValueError, KeyError, TypeError) as problem:
+        raise _damaged(path, problem) from problem
+    if not is_ours:
         raise SequenceError(
             f"{folder} holds an unfinished reconstruction with other settings; give the same ones "
             "to go on, another --output, or --fresh to begin anew."
         )
-    start = _start(kept, about)
-    logs = tuple(
-        FrameLog(*log)._replace(T_keyframe_camera=None if np.isnan(T).any() else T)
-        for log, T in zip(about["logs"], kept["T_keyframe_camera"], strict=True)
+    try:
+        start = _start(kept, about)
+        logs = tuple(
+            FrameLog(*log)._replace(T_keyframe_camera=None if np.isnan(T).any() else T)
+            for log, T in zip(about["logs"], kept["T_keyframe_camera"], strict=True)
+        )
+        return Progress(_state(kept, about, start, logs, sequence, prior, mapping), start, logs)
+    except SequenceError:  # a frame that could be read before
+        raise
+    except (ValueError, KeyError, TypeError, IndexError) as problem:
+        raise _damaged(path, problem) from problem
+
+
+def _damaged(path: Path, problem: Exception) -> SequenceError:
+    return SequenceError(
+        f"{path} cannot be read ({problem}); remove it, or add --fresh to begin anew."
     )
-    return Progress(_state(kept, about, start, logs, sequence, prior, mapping), start, logs)
 
 
 def _start(kept: dict[str, np.ndarray], about: dict[str, Any]) -> Start:
@@ -133,6 +143,7 @@ def _start(kept: dict[str, np.ndarray], about: dict[str, Any]) -> Start:
     return Start(
         index=about["index"],
         masked=kept.get("masked"),
+        core=kept.get("core"),
         box=Box(kept["box"], kept["size"], kept["exclude"]),
         T_world_camera=kept["start"],
         T_level_world=kept.get("T_level_world"),
@@ -168,7 +179,7 @@ def _state(
         odometry = T_previous, information
         prepared = prepared._replace(masked=masked)
         if start.T_level_world is not None and frame.mask is None:
-            prepared = prepared._replace(parts=parts_in(prepared, first=number == 0))
+            prepared = prepared._replace(parts=parts_in(prepared, None if number else start.core))
         keyframes.append(keyframe_of(prepared, place, T, odometry, segmented))
     assert view is not None
     return assemble(

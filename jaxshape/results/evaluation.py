@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Key
 
+from jaxshape import checks, limits
 from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.capture import camera_distance, capture, fused_grids, sensor_of
 from jaxshape.data.dataset import hash_seed
@@ -57,6 +58,14 @@ class EvaluateConfig(CameraConfig):
     ceiling: bool = False
     refine: RefineConfig = field(default_factory=RefineConfig)
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.seed("seed", self.seed)
+        if not self.frames:
+            checks.refuse("frames", self.frames, "numbers of frames, 1 or more each")
+        for number in self.frames:
+            checks.whole("frames", number, 1, limits.FRAMES, "that is ten times around")
 
 
 NOTHING = "No pixel of some number of frames meets the mesh: it is too thin for the camera."

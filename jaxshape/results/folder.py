@@ -4,7 +4,6 @@ A folder may be old, half written, or rewritten at this moment: a file that is m
 and of one that cannot be read, `problems` tells.
 """
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, UInt8
 
+from jaxshape import limits, reading
+from jaxshape.data.sequences.frames import SequenceError, opened
 from jaxshape.results.surface import read_ply
 
 GRIDS = ("occupied", "occluded", "encoder", "refined", "composed", "truth")
@@ -107,7 +108,7 @@ def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
     mesh, measured, color = read("mesh.ply", read_ply, (None, None, None))
     return ResultFolder(
         name=folder.resolve().name,
-        result=read("result.json", _object, {}),
+        result=read("result.json", reading.read_json_object, {}),
         mesh=mesh,
         measured=measured,
         color=color,
@@ -158,14 +159,12 @@ def half_field_of_view(found: ResultFolder) -> tuple[float, float]:
 
 def picture(keyframe: KeyframeRecord, kind: str) -> UInt8[np.ndarray, "h w *c"] | Any | None:
     """The pixels of a keyframe's image, depth or mask, as stored; `None` where unreadable."""
-    from PIL import Image
-
     if kind not in keyframe.files:
         return None
     try:
-        with Image.open(keyframe.files[kind]) as image:
+        with opened(keyframe.files[kind]) as image:
             return np.asarray(image.convert("RGB") if kind == "image" else image)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except SequenceError:
         return None
 
 
@@ -178,25 +177,24 @@ def thumbnail(image: Any, width: int) -> Any:
 # ------------------------------------------------------------------ one file each
 
 
-def _object(path: Path) -> dict[str, Any]:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(content, dict):
-        raise ValueError(f"a JSON object is expected, but it holds a {type(content).__name__}")
-    return content
-
-
 def _grids(path: Path) -> tuple[dict[str, Any], tuple[Any, ...]]:
-    with np.load(path, allow_pickle=False) as file:
-        grids = {name: file[name].astype(bool) for name in GRIDS if name in file}
-        frame = tuple(np.asarray(file[name], float) for name in ("origin", "voxel_size"))
-        T_world_object = pose_of(file["T_world_object"])
-    if any(grid.ndim != 3 for grid in grids.values()) or T_world_object is None:
-        raise ValueError("grids with three axes and a 4x4 T_world_object are expected")
-    return grids, (*frame, T_world_object)
+    kept = reading.read_arrays(path, (*GRIDS, "origin", "voxel_size", "T_world_object"))
+    grids = {name: kept[name].astype(bool) for name in GRIDS if name in kept}
+    origin, size = (np.asarray(kept[name], np.float64) for name in ("origin", "voxel_size"))
+    T_world_object, shapes = pose_of(kept["T_world_object"]), {one.shape for one in grids.values()}
+    if T_world_object is None or len(shapes) > 1 or not all(map(_is_grid, shapes)):
+        raise ValueError("grids of one size with three axes and a 4x4 T_world_object are expected")
+    if not (origin.shape == size.shape == (3,) and np.isfinite(origin).all() and (size > 0).all()):
+        raise ValueError("three numbers of origin and of voxel_size are expected")
+    return grids, (origin, size, T_world_object)
+
+
+def _is_grid(shape: tuple[int, ...]) -> bool:
+    return len(shape) == 3 and 1 <= min(shape) <= max(shape) <= limits.RESOLUTION
 
 
 def _keyframes(path: Path) -> tuple[list[KeyframeRecord], list[dict[str, Any]], Any, Any]:
-    content, folder = _object(path), path.parent.resolve()
+    content, folder = reading.read_json_object(path), path.parent.resolve()
 
     def files(entry: dict[str, Any]) -> dict[str, Path]:
         named = {kind: (folder / str(entry[kind])).resolve() for kind in IMAGES if entry.get(kind)}
@@ -213,18 +211,26 @@ def _keyframes(path: Path) -> tuple[list[KeyframeRecord], list[dict[str, Any]], 
     return (
         keyframes,
         [dict(frame) for frame in content.get("frames") or []],
-        tuple(float(x) for x in intrinsics) if intrinsics else None,
-        tuple(int(x) for x in shape) if shape else None,
+        _positive(intrinsics, 4) if intrinsics else None,
+        tuple(map(int, _positive(shape, 2))) if shape else None,
     )
 
 
+def _positive(value: Any, count: int) -> tuple[float, ...]:
+    numbers = reading.numbers_of(value, (count,))
+    if not ((numbers > 0) & (numbers < limits.FAR)).all():
+        raise ValueError(f"{numbers.tolist()} should be above 0")
+    return tuple(numbers.tolist())
+
+
 def pose_of(value: Any) -> Float[np.ndarray, "4 4"] | None:
-    """A 4x4 matrix of finite numbers, or `None`."""
+    """A 4x4 matrix of finite numbers that has an inverse, or `None`."""
     try:
         pose = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
-    return pose if pose.shape == (4, 4) and np.isfinite(pose).all() else None
+    is_pose = pose.shape == (4, 4) and bool((np.abs(pose) <= limits.FAR).all())
+    return pose if is_pose and abs(np.linalg.det(pose)) > 1e-12 else None
 
 
 def _stand_in(keyframes: list[KeyframeRecord]) -> tuple[Any, ...]:

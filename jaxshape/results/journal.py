@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from jaxshape import reading
 from jaxshape.files import write_text
 
 
@@ -24,8 +25,8 @@ class Journal:
         self.rows: dict[str, Any] = {}
         self.seconds = 0.0
         if path.is_file():
-            earlier = json.loads(path.read_text())
-            if earlier.get("settings") == self.settings:
+            earlier = _read(path)
+            if earlier["settings"] == self.settings:
                 self.rows, self.seconds = earlier["rows"], earlier["seconds"]
 
     def add(self, rows: dict[str, Any], seconds: float) -> None:
@@ -53,3 +54,17 @@ class Journal:
     def remove(self) -> None:
         """Remove the file, where what the rows come to stands elsewhere."""
         self.path.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The content of a journal; `ValueError` if it is none."""
+    try:
+        content = reading.read_json_object(path)
+        kinds = {"settings": dict, "rows": dict, "seconds": (int, float)}
+        if wrong := [name for name, kind in kinds.items() if not isinstance(content[name], kind)]:
+            raise ValueError(f"its {wrong[0]} are damaged")
+    except (OSError, ValueError, KeyError) as problem:
+        raise ValueError(
+            f"{str(path)!r} cannot be gone on with ({problem}); remove it to begin anew."
+        ) from problem
+    return content

@@ -11,13 +11,14 @@ Every file is replaced at once, when the new one is whole, so that `jaxshape vie
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from jaxshape.data.sequences import Sequence, Trajectory, write_trajectory
+from jaxshape.data.sequences import Sequence, SequenceError, Trajectory, write_trajectory
 from jaxshape.data.sequences.cameras import intrinsic_numbers
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.distance import DistanceField
@@ -119,7 +120,10 @@ def color_views(sequence: Sequence, progress: Progress) -> Iterator[ColorView]:
     """The keyframes that have colours, at their present poses, read one after the other."""
     T_object_world = np.linalg.inv(progress.state.place.box.T_world_object)
     for log, keyframe in _fused(progress):
-        frame = sequence[log.index]
+        try:
+            frame = sequence[log.index]
+        except SequenceError:  # it could be read before
+            continue
         if frame.color is not None:
             T_world_camera = np.asarray(keyframe.T_world_camera.as_matrix(), np.float64)
             camera = intrinsic_numbers(frame.intrinsics)
@@ -165,7 +169,9 @@ def _write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> Non
         depth = np.asarray(keyframe.depth)
         millimetres = np.rint(np.where(np.isfinite(depth), depth * 1000, 0)).clip(0, 65534)
         _write_image(folder / f"{log.name}.depth.png", millimetres.astype(np.uint16))
-        color = sequence[log.index].color
+        color = None
+        with suppress(SequenceError):  # it could be read before
+            color = sequence[log.index].color
         if color is not None:
             h, w = segmented.shape
             with atomic_path(folder / f"{log.name}.jpg") as path:

@@ -98,12 +98,8 @@ def _size(result: dict[str, Any]) -> str:
 
 def warnings_of(found: ResultFolder) -> list[str]:
     """Warnings of a result: its own, frames that are not used, and files that are damaged."""
-    given, counts = found.result.get("warnings") or [], _counts(found)
-    unused = [
-        f"{counts[status]} of {len(found.frames)} frames were {status}, and are not fused."
-        for status in ("lost", "unreadable")
-        if counts[status]
-    ]
+    given, lost = found.result.get("warnings") or [], _counts(found)["lost"]
+    unused = [f"{lost} of {len(found.frames)} frames were lost, and are not fused."] if lost else []
     return [*([given] if isinstance(given, str) else map(str, given)), *unused, *found.problems]
 
 

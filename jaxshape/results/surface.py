@@ -1,5 +1,6 @@
 """From a grid of occupancy to a closed triangle mesh, in metres, and to a file."""
 
+import io
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
 
+from jaxshape import limits, reading
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grid import GridFrame
 
@@ -173,11 +175,15 @@ def read_ply(path: str | os.PathLike[str]) -> MeshFile:
         path: The file.
 
     Raises:
-        ValueError: It has no faces, or vertices that are not finite.
+        ValueError: It has no faces, or vertices that are not finite or far away.
     """
-    mesh = trimesh.load_mesh(path, process=False)  # processing would change the vertices
-    if not np.isfinite(mesh.vertices).all() or len(mesh.faces) == 0:
-        raise ValueError("it has no faces, or vertices that are not finite")
+    content = io.BytesIO(reading.read_bytes(path, limits.MESH_BYTES))
+    # Processing would change the vertices.
+    mesh: Any = trimesh.load_mesh(content, file_type="ply", process=False)
+    if len(mesh.faces) == 0 or not (np.abs(mesh.vertices) <= limits.FAR).all():
+        raise ValueError(f"it has no faces, or vertices farther than {limits.FAR:g} m")
+    if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise ValueError("its faces have vertices that are not there")
     vertex = mesh.metadata["_ply_raw"]["vertex"]
     measured = vertex["data"]["measured"] > 0 if "measured" in vertex["properties"] else None
     visual: Any = mesh.visual

@@ -1,14 +1,13 @@
 """The course of a search on disk, `trace.npz` of a result folder. [host]"""
 
-import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
 
+from jaxshape import reading
 from jaxshape.files import atomic_path
 from jaxshape.search.refiner import Distribution, Trace
 
@@ -50,11 +49,10 @@ def read_trace(path: str | os.PathLike[str]) -> Trace:
         TraceError: The file is something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
+        arrays: dict[str, Any] = reading.read_arrays(path)  # pyright: ignore[reportAssignmentType]
         drawn = {name: arrays.pop(name) for name in Distribution._fields if name in arrays}
         return Trace(**arrays, distribution=Distribution(**drawn) if drawn else None)
-    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as problem:
+    except (OSError, ValueError, TypeError) as problem:
         raise TraceError(f"{str(path)!r} cannot be read as a trace: {problem}.") from None
 
 
@@ -75,8 +73,8 @@ def read_search(folder: str | os.PathLike[str]) -> Search:
             "`jaxshape reconstruct` or `jaxshape demo`."
         )
     try:
-        result = json.loads((folder / "result.json").read_text())
-    except ValueError as problem:
+        result = reading.read_json_object(folder / "result.json")
+    except (OSError, ValueError) as problem:
         raise TraceError(f"{str(folder / 'result.json')!r} is damaged: {problem}.") from None
     if result.get("method") == "encoder":
         raise TraceError(

@@ -91,18 +91,6 @@ def cma_start(
 ) -> CmaState:
     """The distribution N(point, sigma0^2 I) before the first generation.
 
-    Use it with `cma_ask` and `cma_tell` in your own loop, in JAX or around a simulator:
-
-    >>> import jax, jax.numpy as jnp, jaxshape as js
-    >>> losses_of = jax.vmap(lambda x: jnp.sum((x - 3) ** 2))
-    >>> ask, tell = jax.jit(js.cma_ask, static_argnums=2), jax.jit(js.cma_tell)
-    >>> state = js.cma_start(jnp.zeros(5), sigma0=1.0)
-    >>> for key in jax.random.split(jax.random.key(0), 100):
-    ...     points = ask(key, state, 8)
-    ...     state = tell(state, points, losses_of(points))
-    >>> state.mean.round(2)
-    Array([3., 3., 3., 3., 3.], dtype=float32)
-
     Args:
         point: Centre of the distribution `[d]`.
         sigma0: Standard deviation of every coordinate, above 0.
@@ -116,6 +104,19 @@ def cma_start(
 
     Raises:
         ValueError: A setting is outside its range.
+
+    Examples:
+        Use it with `cma_ask` and `cma_tell` in your own loop, in JAX or around a simulator:
+
+        >>> import jax, jax.numpy as jnp, jaxshape as js
+        >>> losses_of = jax.vmap(lambda x: jnp.sum((x - 3) ** 2))
+        >>> ask, tell = jax.jit(js.cma_ask, static_argnums=2), jax.jit(js.cma_tell)
+        >>> state = js.cma_start(jnp.zeros(5), sigma0=1.0)
+        >>> for key in jax.random.split(jax.random.key(0), 100):
+        ...     points = ask(key, state, 8)
+        ...     state = tell(state, points, losses_of(points))
+        >>> state.mean.round(2)
+        Array([3., 3., 3., 3., 3.], dtype=float32)
     """
     size = checked_population(len(point), sigma0, population)
     return start(point, sigma0, len(point), size, jnp.asarray(loss, point.dtype))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from jaxshape.checks import at_least, one_of, positive, whole, within
+from jaxshape.limits import POPULATION, STEPS
 from jaxshape.model.config import Precision
 
 ObjectiveName = Literal["balanced", "paper", "soft"]
@@ -79,8 +80,8 @@ class RefineConfig:
         one_of("space", self.space, get_args(Space))
         one_of("precision", self.precision, get_args(Precision))
         one_of("symmetry", self.symmetry, (True, False))
-        whole("iterations", self.iterations, 1)
-        whole("population", self.population, 3)
+        whole("iterations", self.iterations, 1, STEPS)
+        whole("population", self.population, 3, POPULATION, "each is a shape to decode")
         for name in ("sigma0", "step_size", "bound"):
             value = getattr(self, name)
             if not (is_array(value) or (value is None and name != "sigma0")):

@@ -83,6 +83,10 @@ def test_a_rule_in_words_is_refused(tmp_path):
         read_box(box_file(tmp_path, content))
 
 
+LEVEL = {
+    "world_to_level": np.eye(4).tolist(),
+    "chair_box_level": {"X": [0, 1], "Y": [0, 1], "h": [0, 1]},
+}
 GOOD = {"T_world_object": np.eye(4).tolist(), "size": [1, 1, 1]}
 
 
@@ -98,6 +102,20 @@ GOOD = {"T_world_object": np.eye(4).tolist(), "size": [1, 1, 1]}
         ({**GOOD, "exclude": [{"min": [0, 0, 0]}]}, "gives None as max"),
         ({**GOOD, "exclude": {"min": [0, 0, 0], "max": [1, 1, 1]}}, "exclude"),
         ({**GOOD, "T_world_object": np.diag([1.0, 1, -1, 1]).tolist()}, "mirrors"),
+        ("[" * 100_000, "nested more than"),
+        ({**GOOD, "size": ["1", 1, 1]}, "as size"),
+        ({**GOOD, "size": [True, 1, 1]}, "as size"),
+        ({**GOOD, "size": [1e30, 1, 1]}, "as size"),
+        ({**GOOD, "size": [1e-30, 1, 1]}, "0.001 to 1000 m"),
+        ({**GOOD, "size": [float("nan"), 1, 1]}, "as size"),
+        ({**GOOD, "exclude": [{"min": [0, 0, float("nan")], "max": [1, 1, 1]}]}, "as min"),
+        ({**GOOD, "exclude": [{"min": [0, 2, 0], "max": [1, 1, 1]}]}, "min is above their max"),
+        ({**GOOD, "T_world_object": [1] * 16}, "as T_world_object"),
+        ({"world_to_level": [1], "chair_box_level": {}}, "as world_to_level"),
+        ({**LEVEL, "world_to_level": np.diag([0, 0, 0, 1.0]).tolist()}, "not orthonormal"),
+        ({**LEVEL, "world_to_level": np.diag([1, 1, 2, 1.0]).tolist()}, "not orthonormal"),
+        ({**LEVEL, "chair_box_level": [1, 2]}, "as chair_box_level"),
+        ({**LEVEL, "exclude_level": "(" * 100_000}, "shorten it"),
     ],
 )
 def test_faults_are_named(tmp_path, content, said):

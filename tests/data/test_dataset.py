@@ -22,6 +22,7 @@ from jaxshape.data.dataset import (
     unpack,
     unpack_measured,
 )
+from jaxshape.data.families import procedural_objects
 from jaxshape.geometry.grids import Grids
 
 CONFIG = DatasetConfig(paths=2, frames=(1, 2), cameras=("paper",))
@@ -193,7 +194,9 @@ def test_an_object_of_which_nothing_is_measured_is_left_out(tmp_path, monkeypatc
         return paths.Path(np.ones((32, 32, 32), bool), Grids(empty, empty))
 
     monkeypatch.setattr(dataset, "draw_path", draw_path)
-    *_, progress = build_here(tmp_path, range(1), replace(CONFIG, frames=(1,), paths=1))
+    *_, progress = build_here(
+        tmp_path, procedural_objects("chair", 1), replace(CONFIG, frames=(1,), paths=1)
+    )
     assert len(set(drawn)) == 3
     assert [(s.name, s.reason) for s in progress.skipped] == [("chair-0", "nothing measured")]
 

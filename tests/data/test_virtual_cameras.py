@@ -9,7 +9,7 @@ import trimesh
 from jaxshape.data import render
 from jaxshape.data.capture import camera_distance, capture, fuse_frames, sensor_of
 from jaxshape.data.chairs import random_chair
-from jaxshape.data.dataset import TEST_SEEDS
+from jaxshape.data.families import TEST_SEEDS
 from jaxshape.data.virtual_cameras import CAMERAS, VirtualCamera, virtual_camera
 from jaxshape.geometry import camera, distance
 from jaxshape.geometry.camera import Intrinsics

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 import cad_seats
-from cad_seats import Seat, collect, read_list
+from cad_seats import LISTS, Piece, collect, read_list
 from jaxshape.data.meshes import Model, read_meshes
 
 CATALOGUE = """
@@ -41,7 +41,7 @@ def packages(tmp_path):
 
 
 def seat(name="one", file="models/some.sh3f", member="a/step.obj", size=(0.6, 0.4, 0.2)):
-    return Seat(name, "stool", "Step", "N. N.", "CC0", "some 1.0", file, member, list(size))
+    return Piece(name, "stool", "Step", "N. N.", "CC0", "some 1.0", file, member, list(size))
 
 
 def test_seats_are_turned_scaled_and_named(packages):
@@ -72,8 +72,15 @@ def test_what_is_missing_or_of_another_version_is_said(packages, wrong, sentence
     assert not (packages / "out/manifest.json").exists()
 
 
-def test_every_seat_of_the_list_is_free_and_has_a_creator():
-    seats = read_list()
-    assert len(seats) == 78 == len({one.name for one in seats})
-    assert {one.kind for one in seats} == {"chair", "armchair", "stool", "other_seat"}
-    assert all(one.creator and one.licence.startswith(("CC0", "CC-BY-3.0")) for one in seats)
+@pytest.mark.parametrize(
+    ("name", "count", "kinds"),
+    [
+        ("seats", 78, {"chair", "armchair", "stool", "other_seat"}),
+        ("tables", 62, {"table", "low_table", "desk"}),
+    ],
+)
+def test_every_piece_of_a_list_is_free_and_has_a_creator(name, count, kinds):
+    pieces = read_list(LISTS[name])
+    assert len(pieces) == count == len({one.name for one in pieces})
+    assert {one.kind for one in pieces} == kinds
+    assert all(one.creator and one.licence.startswith(("CC0", "CC-BY-3.0")) for one in pieces)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cad_seats import read_list
+from cad_seats import LISTS, read_list
 from gallery import at_percentiles, credit
 from study import Subject
 
@@ -21,6 +21,6 @@ def test_few_chairs_are_shown_once_and_one_is_the_median():
 
 
 def test_seats_are_credited():
-    seat = read_list()[0]
+    seat = read_list(LISTS["seats"])[0]
     told = credit(Subject(seat.name, "CAD", 0))
     assert seat.creator in told and seat.licence in told

@@ -9,6 +9,7 @@ import pytest
 
 from jaxshape.data.building import build_dataset
 from jaxshape.data.config import DatasetConfig
+from jaxshape.data.families import procedural_objects
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "training_choices.py"
 
@@ -16,7 +17,7 @@ SCRIPT = Path(__file__).parents[2] / "experiments" / "training_choices.py"
 @pytest.mark.slow
 def test_smoke(tmp_path):
     settings = DatasetConfig(frames=(1, 2), cameras=("paper",))
-    for _ in build_dataset(tmp_path / "data", range(12), settings, workers=1):
+    for _ in build_dataset(tmp_path / "data", procedural_objects("chair", 12), settings, workers=1):
         pass
     command = [sys.executable, SCRIPT, "--dataset", tmp_path / "data", "--output", tmp_path / "out",
                "--smoke"]  # fmt: skip

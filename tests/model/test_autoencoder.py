@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -65,7 +66,7 @@ def trained(params, grids):
         def total(weights):
             variables = {**params, "params": weights}
             (logits, _), updates = AutoEncoder(TINY).apply(
-                variables, grids, train=True, mutable=["batch_stats"]
+                variables, grids[..., None], train=True, mutable=["batch_stats"]
             )
             return jnp.mean(jnp.sin(50 * logits + 1)), updates
 
@@ -140,16 +141,28 @@ def test_training_moves_the_batch_statistics_and_evaluation_does_not(params, tra
     for name, before in flatten(params["batch_stats"]).items():
         assert np.all(moved[name] != before), name
     evaluate = partial(AutoEncoder(TINY).apply, train=False, mutable=["batch_stats"])
-    same = jax.jit(lambda params, grid: evaluate(params, grid)[1])(params, grids[0, :1])
+    same = jax.jit(lambda params, grid: evaluate(params, grid)[1])(params, grids[0, :1, ..., None])
     jax.tree.map(np.testing.assert_array_equal, same["batch_stats"], params["batch_stats"])
 
 
 def test_noise_is_added_to_the_code_and_reaches_the_grid_alone(params, grids, codes):
     run = jax.jit(partial(AutoEncoder(TINY).apply, train=False))
-    logits, code = run(params, grids[0], noise=codes[0])
+    logits, code = run(params, grids[0][..., None], noise=codes[0])
     np.testing.assert_allclose(code[None], jax.jit(encode)(params, grids), atol=1e-6)
     noisy = jax.jit(decode)(params, code[None] + codes)
     np.testing.assert_allclose(logits[None], noisy, atol=1e-5)
+
+
+def test_only_an_encoder_that_is_given_the_occlusion_mask_heeds_it(params):
+    """And it takes both grids as soft as they are, where the paper's rounds F."""
+    F, M = np.random.default_rng(2).uniform(0, 0.5, (2, 1, 32, 32, 32)).astype(np.float32)
+    both = initialize(jax.random.key(0), replace(TINY, occlusion=True))
+    assert architecture_of(both) == replace(TINY, occlusion=True)
+    code = jax.jit(AUTOENCODER.encode)
+    for weights, heeds in ((params, False), (both, True)):
+        first = code(weights, Grids(F + 0.5, M))
+        for other in (Grids(F + 0.5, M / 2), Grids(F / 2 + 0.5, M)):
+            assert np.any(code(weights, other) != first) == heeds
 
 
 def test_sizes_are_read_off_the_parameters(params):

@@ -9,7 +9,7 @@ import pytest
 
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
-from jaxshape.data.dataset import TEST_SEEDS
+from jaxshape.data.families import TEST_SEEDS
 from jaxshape.geometry import camera, fusion
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou

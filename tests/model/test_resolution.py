@@ -8,7 +8,8 @@ from jaxshape.data.building import build_dataset
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.config import DatasetConfig
-from jaxshape.data.dataset import TEST_SEEDS, open_dataset
+from jaxshape.data.dataset import open_dataset
+from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.geometry import camera, fusion
 from jaxshape.model.config import Architecture, TrainConfig
 from jaxshape.model.training import finished_prior, train
@@ -30,7 +31,7 @@ def test_a_network_of_another_resolution_trains_refines_and_meshes(tmp_path, enc
     list(
         build_dataset(
             tmp_path / "d",
-            range(8),
+            procedural_objects("chair", 8),
             DatasetConfig(frames=(1, 2), cameras=("paper",), resolution=n),
             workers=1,
         )
@@ -60,7 +61,7 @@ def test_a_dataset_of_another_resolution_is_refused(tmp_path):
     list(
         build_dataset(
             tmp_path / "d",
-            range(2),
+            procedural_objects("chair", 2),
             DatasetConfig(frames=(1,), cameras=("paper",), resolution=8),
             workers=1,
         )

@@ -223,3 +223,35 @@ def test_large_parameters_are_not_lost_in_half_precision(tmp_path):
     large = {"basis": jnp.full((3, 8, 8, 8), 1e6)}
     save_prior(path, ShapePrior(OWN, large, jnp.zeros(3), jnp.eye(3)), {})
     np.testing.assert_array_equal(load_prior(path, OWN).params["basis"], 1e6)
+
+
+def test_weights_in_bytes_are_within_half_a_step_and_half_the_size(prior, saved, tmp_path):
+    path = tmp_path / "bytes.safetensors"
+    save_prior(path, prior, CARD, in_bytes=True)
+    assert load_card(path) == CARD
+    for name, found in weights.flatten(load_prior(path).params).items():
+        expected = np.asarray(weights.flatten(prior.params)[name])
+        if expected.ndim == 1 or expected.size < weights.LEAST_IN_BYTES:
+            np.testing.assert_array_equal(found, np.float32(np.float16(expected)), name)
+        else:
+            largest = np.abs(expected).max(axis=tuple(range(expected.ndim - 1)))
+            assert (np.abs(found - expected) <= 0.5001 * largest / 127).all(), name
+            assert np.any(found != expected), name
+    assert path.stat().st_size < 0.7 * saved.stat().st_size
+
+
+def test_a_channel_of_zeros_stays_zero_in_bytes(tmp_path):
+    path = tmp_path / "own.safetensors"
+    own = {"basis": jnp.ones((3, 16, 16, 16)).at[..., 5].set(0)}
+    save_prior(path, ShapePrior(OWN, own, jnp.zeros(3), jnp.eye(3)), {}, in_bytes=True)
+    np.testing.assert_allclose(load_prior(path, OWN).params["basis"], own["basis"], rtol=1e-6)
+
+
+def test_factors_of_other_channels_are_refused(prior, tmp_path):
+    path = tmp_path / "bytes.safetensors"
+    save_prior(path, prior, CARD, in_bytes=True)
+    tensors = load_file(path)
+    tensors[weights.FACTORS + KERNEL] = np.ones(3, np.float32)
+    save_file(tensors, path, {"format": weights.FORMAT_IN_BYTES, "card": json.dumps(CARD)})
+    with pytest.raises(WeightsError, match=r"conv1 has \d+ channels and \(3,\) factors"):
+        load_prior(path)

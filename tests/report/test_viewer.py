@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+import socket
 import time
 import urllib.request
 
@@ -16,6 +17,7 @@ from jaxshape.cli import common, viewing
 
 pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
 from jaxshape.report import viewer
+from jaxshape.report.guard import is_own
 from jaxshape.report.viewer import LiveView, view
 
 GRIDS = {"/occupied", "/occluded", "/encoder", "/refined", "/composed", "/truth"}
@@ -44,6 +46,46 @@ def test_it_answers_at_the_address_it_tells(folder, open_view):
     assert live.url.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(live.url, timeout=10) as answer:
         assert answer.status == 200 and b"<html" in answer.read()
+
+
+def answer(live, host, origin=None, upgrade=False):
+    """The first line of the answer to a request."""
+    port = live.server.get_port()
+    lines = ["GET / HTTP/1.1", f"Host: {host.format(port=port)}"]
+    lines += [f"Origin: {origin.format(port=port)}"] if origin else []
+    if upgrade:
+        lines += ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
+        lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol: viser-v1"]
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        return connection.recv(100).decode().split("\r\n")[0]
+
+
+def test_pages_of_others_get_nothing(folder, open_view):
+    """A page from anywhere can ask at 127.0.0.1, and a name of anyone can point there."""
+    live, own = open_view(folder), "127.0.0.1:{port}"
+    for upgrade, status in ((False, "200"), (True, "101")):
+        for host in (own, "localhost:{port}", "[::1]:{port}"):
+            assert status in answer(live, host, f"http://{host}", upgrade=upgrade)
+        assert status in answer(live, own, upgrade=upgrade)
+        for host, origin in (
+            ("evil.example:{port}", None),
+            ("evil.example:{port}", "http://evil.example:{port}"),
+            (own, "http://evil.example"),
+            (own, "null"),
+            (own, "http://127.0.0.1:1"),
+            ("127.0.0.1.evil.example", None),
+        ):
+            assert "403" in answer(live, host, origin, upgrade=upgrade), (host, origin)
+
+
+@pytest.mark.parametrize("served", ["0.0.0.0", "192.168.1.7"])
+def test_on_a_network_the_machine_is_asked_by_its_number_or_its_name(served):
+    own = (f"{socket.gethostname()}:8080", "192.168.1.7:8080", "[fe80::1]:8080")
+    assert all(is_own([host], [f"http://{host}"], served) for host in own)
+    assert not is_own(["evil.example"], [], served)
+    assert not is_own([own[0]], ["http://evil.example"], served)
+    assert not is_own([], [], served) and not is_own([own[1], own[1]], [], served)
 
 
 def test_the_scene_holds_shape_grids_and_cameras(folder, open_view):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +52,16 @@ def test_every_frame_is_listed_with_what_became_of_it(written, steps, walk):
         expected = walk.depth[keyframe["index"]]
         np.testing.assert_array_equal(millimetres, expected)
         assert (folder / keyframe["mask"]).is_file() and "image" not in keyframe
+
+
+def test_a_frame_that_vanishes_costs_its_colour_alone(sequence, steps):
+    files = tuple(one._replace(color=one.depth) for one in sequence.files)
+    whole = replace(sequence, files=files)
+    views = list(color_views(whole, steps[-1]))
+    gone = next(log.index for log in steps[-1].logs if log.status == "keyframe")
+    files = (*files[:gone], files[gone]._replace(depth=Path("gone.png")), *files[gone + 1 :])
+    left = list(color_views(replace(whole, files=files), steps[-1]))
+    assert len(left) == len(views) - 1 > 0
 
 
 def test_the_report_has_a_column_for_every_figure_of_a_keyframe(written):

@@ -3,21 +3,30 @@
 import numpy as np
 
 from jaxshape.data.chairs.backs import Rest
-from jaxshape.data.chairs.draw import Draw, Number, Weights
-from jaxshape.data.chairs.primitives import Part, bars, bend, both_sides, box, cushion, slab, tubes
-from jaxshape.data.chairs.seats import Seat
+from jaxshape.data.procedural.boards import Board
+from jaxshape.data.procedural.draw import Draw, Number, Weights
+from jaxshape.data.procedural.primitives import (
+    Part,
+    bars,
+    bend,
+    both_sides,
+    box,
+    cushion,
+    slab,
+    tubes,
+)
 
 HUNG_ARMS = {"loop": 0.45, "pads": 0.3, "panel": 0.15, "wrap": 0.1}  # none reaches the floor
 FRAMED_ARMS = {"posts": 0.35, "loop": 0.2, "panel": 0.16, "wrap": 0.14, "pads": 0.08,
                "floor loop": 0.05, "side": 0.05}  # fmt: skip
 
 
-def arm_parts(draw: Draw, seat: Seat, rest: Rest, options: Weights) -> list[Part]:
+def arm_parts(draw: Draw, seat: Board, rest: Rest, options: Weights) -> list[Part]:
     height = seat.height + draw.between(0.16, 0.28)
     return _ARMS[draw.named("arms", options)](draw, seat, rest, height)
 
 
-def _posts(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
+def _posts(draw: Draw, seat: Board, rest: Rest, y: Number) -> list[Part]:
     """A rest on a front post, running back to the back's upright."""
     x, front = seat.width / 2 + draw.between(-0.02, 0.03), seat.depth / 2 - draw.between(0, 0.18)
     share = min((y - rest.y) / rest.height, 1.0)
@@ -41,7 +50,7 @@ def _posts(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
     return parts
 
 
-def _loop(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
+def _loop(draw: Draw, seat: Board, rest: Rest, y: Number) -> list[Part]:
     """A bent tube or band: up from the seat, back along the arm, to the back or down again."""
     x = seat.width / 2 + draw.between(0.0, 0.04)
     front, low = seat.depth / 2 - draw.between(0.02, 0.15), seat.height - 0.03
@@ -58,7 +67,7 @@ def _loop(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
     return [both_sides(tubes(path, radius, across=across, sides=sides))]
 
 
-def _floor_loop(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
+def _floor_loop(draw: Draw, seat: Board, rest: Rest, y: Number) -> list[Part]:
     """Front leg, arm and back leg bent from one tube or flat bar."""
     x, z = seat.width / 2 + draw.between(0.01, 0.04), seat.depth / 2
     radius, across = draw.between(0.008, 0.015), draw.between(0.01, 0.03)
@@ -71,7 +80,7 @@ def _floor_loop(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
     return [both_sides(tubes(bend(corners, 0.07), radius, across=across, sides=8))]
 
 
-def _panel(draw: Draw, seat: Seat, rest: Rest, y: Number, low: Number | None = None) -> list[Part]:
+def _panel(draw: Draw, seat: Board, rest: Rest, y: Number, low: Number | None = None) -> list[Part]:
     """A solid side, from just under the seat or from the height `low`."""
     thick = draw.between(0.02, 0.12)
     x, length = seat.width / 2 + thick / 2 - 0.01, seat.depth * draw.between(0.75, 1.0)
@@ -84,12 +93,12 @@ def _panel(draw: Draw, seat: Seat, rest: Rest, y: Number, low: Number | None = N
     return [both_sides(slab(surface, thick))]
 
 
-def _side(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
+def _side(draw: Draw, seat: Board, rest: Rest, y: Number) -> list[Part]:
     """A solid side from the floor."""
     return _panel(draw, seat, rest, y, low=0.0)
 
 
-def _wrap(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
+def _wrap(draw: Draw, seat: Board, rest: Rest, y: Number) -> list[Part]:
     """One bow that is both arms and the lower back, on posts or spindles."""
     reach, depth = seat.width / 2 + draw.between(0.0, 0.05), seat.depth * draw.between(0.85, 1.0)
     angle = np.linspace(-np.pi / 2, np.pi / 2, 11)
@@ -109,7 +118,7 @@ def _wrap(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
     return [*parts, bars(bow[where], foot, draw.between(0.01, 0.022), sides=6)]
 
 
-def _pads(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
+def _pads(draw: Draw, seat: Board, rest: Rest, y: Number) -> list[Part]:
     """Office arms: a pad on one upright or on a bracket."""
     x, z = seat.width / 2 + draw.between(0.01, 0.05), draw.between(-0.08, 0.06)
     pad = cushion((x, y, z + 0.03), (draw.between(0.04, 0.08), draw.between(0.025, 0.04),
@@ -121,7 +130,7 @@ def _pads(draw: Draw, seat: Seat, rest: Rest, y: Number) -> list[Part]:
                                               sides=4))]  # fmt: skip
 
 
-def tray(draw: Draw, seat: Seat) -> list[Part]:
+def tray(draw: Draw, seat: Board) -> list[Part]:
     """The tray of a high chair or the tablet of a lecture chair, on its brackets."""
     y = seat.height + draw.between(0.17, 0.25)
     z, x = seat.depth / 2 + draw.between(-0.05, 0.08), seat.width / 2 + 0.02

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxshape.data.chairs.draw import Draw, Number, Range, Weights
-from jaxshape.data.chairs.primitives import Part, slab, tubes
-from jaxshape.data.chairs.seats import Seat
+from jaxshape.data.procedural.boards import Board
+from jaxshape.data.procedural.draw import Draw, Number, Range, Weights
+from jaxshape.data.procedural.primitives import Part, slab, tubes
 
 
 class Rest(NamedTuple):
@@ -44,7 +44,7 @@ class Rest(NamedTuple):
         return np.stack(np.broadcast_arrays(x, y, z), -1)
 
 
-def draw_rest(draw: Draw, seat: Seat, height: Range = (0.34, 0.64)) -> Rest:
+def draw_rest(draw: Draw, seat: Board, height: Range = (0.34, 0.64)) -> Rest:
     """A rest that stands on the back edge of the seat."""
     z = -seat.depth / 2 + draw.between(0.0, 0.03)
     back = seat.half_width(z) * (1.0 if seat.exponent > 2.5 else 0.75)

@@ -1,7 +1,5 @@
 """The styles of the family: which seats, bases, backs and arms meet, how often, how big."""
 
-from collections.abc import Callable
-
 import numpy as np
 import trimesh
 
@@ -9,9 +7,18 @@ from jaxshape.data.chairs import shells, upholstery
 from jaxshape.data.chairs.arms import FRAMED_ARMS, HUNG_ARMS, arm_parts, tray
 from jaxshape.data.chairs.backs import FRAMED_BACKS, back_parts, draw_rest
 from jaxshape.data.chairs.bases import base_parts, foot_ring
-from jaxshape.data.chairs.draw import Draw, Number, Range, Weights
-from jaxshape.data.chairs.primitives import Part, assemble, bars, both_sides, cushion, shift, tilt
-from jaxshape.data.chairs.seats import FRAMED_SEATS, Seat, draw_seat, seat_parts
+from jaxshape.data.chairs.seats import FRAMED_SEATS, draw_seat, seat_parts
+from jaxshape.data.procedural.boards import Board
+from jaxshape.data.procedural.draw import Draw, Number, Range, Weights
+from jaxshape.data.procedural.family import Family, Styles, make
+from jaxshape.data.procedural.primitives import (
+    Part,
+    bars,
+    both_sides,
+    cushion,
+    shift,
+    tilt,
+)
 
 UPHOLSTERED = {"pad": 0.6, "block": 0.25, "dished": 0.15}
 PADDED_BACKS = {"solid": 0.55, "pads": 0.25, "panel": 0.15, "frame": 0.05}
@@ -19,7 +26,7 @@ PADDED_BACKS = {"solid": 0.55, "pads": 0.25, "panel": 0.15, "frame": 0.05}
 
 def _framed(
     draw: Draw,
-    seat: Seat,
+    seat: Board,
     *,
     bases: Weights,
     seats: Weights = FRAMED_SEATS,
@@ -85,7 +92,7 @@ def _pedestal(draw: Draw) -> list[Part]:
     return _tub_on(draw, seat, bases)
 
 
-def _tub_on(draw: Draw, seat: Seat, bases: Weights) -> list[Part]:
+def _tub_on(draw: Draw, seat: Board, bases: Weights) -> list[Part]:
     """A seat with a wrap-around wall on any base."""
     seat = seat._replace(width=seat.width * draw.between(1.05, 1.35), exponent=2.2, taper=0.0)
     deep = draw.between(0.02, 0.16)
@@ -208,7 +215,7 @@ def _easy_chair(draw: Draw) -> list[Part]:
 
 def _recliner(draw: Draw) -> list[Part]:
     """A padded, leaning lounge chair on a low base, sometimes with its foot-stool in front."""
-    seat = Seat(draw.between(0.48, 0.72), draw.between(0.46, 0.62), draw.between(0.34, 0.46))
+    seat = Board(draw.between(0.48, 0.72), draw.between(0.46, 0.62), draw.between(0.34, 0.46))
     bases = {"star": 0.35, "disc": 0.2, "four legs": 0.25, "armed loop": 0.1, "sled": 0.1}
     small = seat._replace(width=seat.width * 0.85, depth=seat.depth * 0.8, thickness=0.08)
     parts = shells.padded_parts(draw, seat) + base_parts(draw, small, bases)
@@ -255,7 +262,7 @@ def _barrel(draw: Draw) -> list[Part]:
 
 def _egg(draw: Draw) -> list[Part]:
     height = draw.between(0.36, 0.44)
-    seat = Seat(draw.between(0.5, 0.65), 0.5, height - 0.2, thickness=0.0, exponent=2.2)
+    seat = Board(draw.between(0.5, 0.65), 0.5, height - 0.2, thickness=0.0, exponent=2.2)
     return upholstery.egg_parts(draw, height) + base_parts(
         draw, seat, {"star": 0.45, "disc": 0.3, "four legs": 0.25})  # fmt: skip
 
@@ -266,7 +273,7 @@ def _pouffe(draw: Draw) -> list[Part]:
 
 def _floor_chair(draw: Draw) -> list[Part]:
     """A legless chair: a shell or a pad with a back, on the floor."""
-    seat = Seat(draw.between(0.42, 0.58), draw.between(0.42, 0.55), draw.between(0.04, 0.12))
+    seat = Board(draw.between(0.42, 0.58), draw.between(0.42, 0.55), draw.between(0.04, 0.12))
     if draw.chance(0.5):
         return shells.shell_parts(draw, seat)
     rest = draw_rest(draw, seat, (0.35, 0.55))
@@ -284,7 +291,7 @@ def _wheelchair(draw: Draw) -> list[Part]:
     return parts + _wheels(draw, seat)
 
 
-def _wheels(draw: Draw, seat: Seat) -> list[Part]:
+def _wheels(draw: Draw, seat: Board) -> list[Part]:
     radius, x = draw.between(0.26, 0.32), seat.width / 2 + 0.06
     center = np.array([x, radius, -seat.depth * draw.between(0.2, 0.45)])
     flat = foot_ring(0.0, radius, 0.012)
@@ -295,7 +302,7 @@ def _wheels(draw: Draw, seat: Seat) -> list[Part]:
     return [both_sides(rim), both_sides(spokes)]
 
 
-_FAMILY: dict[str, tuple[float, Callable[[Draw], list[Part]]]] = {
+_STYLES: Styles = {
     "side chair": (0.24, _side_chair),
     "armchair": (0.08, _armchair),
     "shell": (0.08, _shell),
@@ -325,13 +332,10 @@ _FAMILY: dict[str, tuple[float, Callable[[Draw], list[Part]]]] = {
     "pouffe": (0.01, _pouffe),
 }
 
-FREQUENCIES: Weights = {
-    name: weight / sum(w for w, _ in _FAMILY.values()) for name, (weight, _) in _FAMILY.items()
-}
+CHAIRS = Family("chair", _STYLES)
+FREQUENCIES: Weights = CHAIRS.frequencies
 STYLES: tuple[str, ...] = tuple(FREQUENCIES)
 VOLUMINOUS: frozenset[str] = frozenset({"club", "wing", "sofa", "barrel", "egg", "pouffe"})
-CHILD_SHARE = 0.04
-STOUT_SHARE = 0.3
 
 
 def random_chair(seed: int | np.integer, *, style: str | None = None) -> trimesh.Trimesh:
@@ -350,18 +354,4 @@ def random_chair(seed: int | np.integer, *, style: str | None = None) -> trimesh
     Raises:
         ValueError: The seed is negative, or there is no such style.
     """
-    if seed < 0:
-        raise ValueError(f"A chair's seed was {seed}; give a whole number that is not negative.")
-    if style is not None and style not in STYLES:
-        raise ValueError(f"Unknown chair style {style!r}; choose one of {', '.join(STYLES)}.")
-    draw = Draw(np.random.default_rng(seed))
-    drawn_style = draw.pick(FREQUENCIES)
-    style = drawn_style if style is None else style
-    if draw.chance(STOUT_SHARE):
-        draw.stoutness = draw.between(0.7, 2.6)
-    mesh = assemble(_FAMILY[style][1](draw))
-    if draw.chance(CHILD_SHARE):
-        mesh.apply_scale(draw.between(0.55, 0.8))
-        draw.record["for"] = "child"
-    mesh.metadata.update(style=style, seed=int(seed), drawn=draw.record)
-    return mesh
+    return make(CHAIRS, seed, style)

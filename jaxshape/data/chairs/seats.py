@@ -1,44 +1,17 @@
 """Seats of framed chairs: boards, pads, slats and slings on an optional apron."""
 
-from typing import NamedTuple
-
 import numpy as np
 
-from jaxshape.data.chairs.draw import Draw, Number, Range, Weights
-from jaxshape.data.chairs.primitives import (
+from jaxshape.data.procedural.boards import Board, apron, outline_of, slats
+from jaxshape.data.procedural.draw import Draw, Number, Range, Weights
+from jaxshape.data.procedural.primitives import (
     Part,
     bars,
-    box,
     cushion,
     plate,
-    shift,
     slab,
     superellipse,
 )
-
-
-class Seat(NamedTuple):
-    """The size of a seat, in metres, about x = z = 0.
-
-    Attributes:
-        width: Extent along x.
-        depth: Extent along z.
-        height: Height of its upper face above the floor.
-        thickness: Extent along y.
-        exponent: Exponent of the outline's superellipse: 2 is round, 10 square.
-        taper: Share of the width by which the back edge is narrower.
-    """
-
-    width: Number
-    depth: Number
-    height: Number
-    thickness: Number = 0.03
-    exponent: Number = 8.0
-    taper: Number = 0.0
-
-    def half_width(self, z: Number) -> float:
-        """Half the seat's width at depth z."""
-        return self.width / 2 * (1 - self.taper * (0.5 - z / self.depth))
 
 
 def draw_seat(
@@ -48,7 +21,7 @@ def draw_seat(
     depth: Range = (0.35, 0.49),
     height: Range = (0.42, 0.48),
     round_chance: Number = 0.12,
-) -> Seat:
+) -> Board:
     """A seat within the given ranges; the taper and the outline follow."""
     seat_width, seat_depth = draw.between(*width), draw.between(*depth)
     is_round = draw.chance(round_chance)
@@ -57,7 +30,7 @@ def draw_seat(
         exponent = 2.0
     else:
         exponent = draw.between(3.0, 8.0) if draw.chance(0.4) else draw.between(8.0, 40.0)
-    return Seat(
+    return Board(
         width=seat_width,
         depth=seat_depth,
         height=draw.between(*height),
@@ -68,8 +41,8 @@ def draw_seat(
 
 
 def seat_parts(
-    draw: Draw, seat: Seat, options: Weights, *, aprons: bool
-) -> tuple[list[Part], Seat]:
+    draw: Draw, seat: Board, options: Weights, *, aprons: bool
+) -> tuple[list[Part], Board]:
     """The parts of a seat, and the seat as its legs see it (without what lies on the frame)."""
     kind = draw.named("seat", options)
     if kind == "block":
@@ -81,28 +54,13 @@ def seat_parts(
     return parts, structural
 
 
-def apron(draw: Draw, seat: Seat) -> list[Part]:
-    """Four rails under the seat, between the legs."""
-    height, thick = draw.between(0.03, 0.08), draw.between(0.015, 0.03)
-    front = seat.depth / 2 - draw.between(0.01, 0.03)
-    y = seat.height - seat.thickness - height / 2
-    corners = np.array(
-        [[s * (seat.half_width(z) - 0.025), y, z] for z, s in
-         ((front, -1), (front, 1), (-front, 1), (-front, -1))])  # fmt: skip
-    return [bars(corners, np.roll(corners, -1, 0), thick, height)]
-
-
-def outline_of(seat: Seat) -> np.ndarray:
-    return superellipse(seat.exponent, taper=seat.taper)
-
-
-def _board(draw: Draw, seat: Seat) -> list[Part]:
+def _board(draw: Draw, seat: Board) -> list[Part]:
     size = (seat.width, seat.thickness, seat.depth)
     bevel = draw.between(0.0, 0.06) if draw.chance(0.4) else 0.0
     return [plate(outline_of(seat), size, seat.height, bevel)]
 
 
-def _dished(draw: Draw, seat: Seat) -> list[Part]:
+def _dished(draw: Draw, seat: Board) -> list[Part]:
     """A bent board: a rolled front edge, a hollow, a rising back."""
     v = np.linspace(-1, 1, 7)[:, None]
     u = np.linspace(-1, 1, 7)
@@ -116,7 +74,7 @@ def _dished(draw: Draw, seat: Seat) -> list[Part]:
     return [slab(surface, seat.thickness)]
 
 
-def _pad(draw: Draw, seat: Seat) -> list[Part]:
+def _pad(draw: Draw, seat: Board) -> list[Part]:
     thick = draw.between(0.035, 0.11)
     center = (0.0, seat.height - 0.02 + thick / 2, 0.0)
     pad = cushion(
@@ -132,38 +90,14 @@ def _pad(draw: Draw, seat: Seat) -> list[Part]:
     return [pad, plate(rim, (seat.width, 0.025, seat.depth), seat.height - 0.005)]
 
 
-def _block(draw: Draw, seat: Seat) -> list[Part]:
+def _block(draw: Draw, seat: Board) -> list[Part]:
     """A thick upholstered or solid block that hangs below the seat's upper face."""
     center = (0.0, seat.height - seat.thickness / 2, 0.0)
     size = (seat.width, seat.thickness, seat.depth)
     return [cushion(center, size, outline=outline_of(seat), edge=draw.between(0.03, 0.2))]
 
 
-def _slats(draw: Draw, seat: Seat) -> list[Part]:
-    """Boards side by side, from left to right or from front to back, on two bearers."""
-    count, share = draw.count(3, 9), draw.between(0.6, 0.9)
-    across = draw.chance(0.7)
-    length = seat.depth if across else seat.width
-    at = (np.arange(count) + 0.5) / count * length - length / 2
-    zero, width = np.zeros(count), length / count * share
-    y = zero + seat.height - seat.thickness / 2
-    dip = draw.between(0.0, 0.025)
-    if across:
-        y = y - dip * (1 - (2 * at / length) ** 2)
-        half = np.array([seat.half_width(z) for z in at])
-        starts, ends = np.stack([-half, y, at], 1), np.stack([half, y, at], 1)
-        side = seat.half_width(-seat.depth / 2) - 0.02
-        bearer = box((side, seat.height - 0.035, 0), (0.02, 0.03, seat.depth * 0.96))
-        bearers = [bearer, shift(bearer, (-2 * side, 0, 0))]
-    else:
-        starts = np.stack([at, y, zero - seat.depth / 2], 1)
-        ends = np.stack([at, y, zero + seat.depth / 2], 1)
-        bearers = [box((0, seat.height - 0.035, s * seat.depth * 0.42),
-                       (seat.width * 0.96, 0.03, 0.02)) for s in (-1, 1)]  # fmt: skip
-    return [bars(starts, ends, width, seat.thickness * 0.6), *bearers]
-
-
-def _sling(draw: Draw, seat: Seat) -> list[Part]:
+def _sling(draw: Draw, seat: Board) -> list[Part]:
     """A sagging cloth or a woven seat."""
     v, u = np.linspace(-1, 1, 5)[:, None], np.linspace(-1, 1, 7)
     sag = draw.between(0.01, 0.06)
@@ -182,7 +116,7 @@ _SEATS = {
     "dished": _dished,
     "pad": _pad,
     "block": _block,
-    "slats": _slats,
+    "slats": slats,
     "sling": _sling,
 }
 

@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxshape.data.chairs.draw import Draw, Number, Range
-from jaxshape.data.chairs.primitives import (
+from jaxshape.data.procedural.boards import Board
+from jaxshape.data.procedural.draw import Draw, Number, Range
+from jaxshape.data.procedural.primitives import (
     Part,
     bars,
     bend,
@@ -16,7 +17,6 @@ from jaxshape.data.chairs.primitives import (
     tubes,
     unit,
 )
-from jaxshape.data.chairs.seats import Seat
 
 # Closer together at both ends, where the outline turns its corners.
 _STATIONS = 0.5 * np.linspace(0, 1, 20) + 0.25 * (1 - np.cos(np.pi * np.linspace(0, 1, 20)))
@@ -63,7 +63,7 @@ def swept(
     return slab(np.stack([half_width[:, None] * u, y, z], 2), thickness)
 
 
-def shell_parts(draw: Draw, seat: Seat, height: Range = (0.3, 0.5)) -> list[Part]:
+def shell_parts(draw: Draw, seat: Board, height: Range = (0.3, 0.5)) -> list[Part]:
     """A shell chair's surface: seat and back bent from one sheet, flat, dished or armed."""
     depth, tall = seat.depth, draw.between(*height)
     lean = tall * draw.between(0.05, 0.35)
@@ -104,7 +104,7 @@ def _corner(draw: Draw, share: np.ndarray) -> np.ndarray:
 
 
 def _lining(
-    draw: Draw, profile: Profile, seat: Seat, width: np.ndarray, curl: np.ndarray, power: Number
+    draw: Draw, profile: Profile, seat: Board, width: np.ndarray, curl: np.ndarray, power: Number
 ) -> Part:
     """A pad that lines the shell, all of it or only the seat."""
     end = draw.between(0.4, 1.0)
@@ -115,7 +115,7 @@ def _lining(
     return swept(inner, seat.width * 0.44 * width[rows], curl[rows] * 0.8, thick, power)
 
 
-def padded_parts(draw: Draw, seat: Seat) -> list[Part]:
+def padded_parts(draw: Draw, seat: Board) -> list[Part]:
     """A thick reclined shell, with stuffed arms and a head-rest now and then."""
     tall, depth = draw.between(0.42, 0.75), seat.depth
     lean = tall * draw.between(0.12, 0.6)
@@ -144,7 +144,7 @@ def padded_parts(draw: Draw, seat: Seat) -> list[Part]:
     return parts
 
 
-def _stuffed_side(draw: Draw, seat: Seat, lean: float) -> Part:
+def _stuffed_side(draw: Draw, seat: Board, lean: float) -> Part:
     """Both arms as thick panels that rise to the back."""
     thick, low = draw.between(0.05, 0.14), seat.height - draw.between(0.05, 0.25)
     z = np.linspace(-seat.depth / 2 - lean * 0.3, seat.depth / 2 - draw.between(-0.03, 0.1), 6)

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxshape.data.chairs.draw import Draw, Number, Range
-from jaxshape.data.chairs.primitives import (
+from jaxshape.data.chairs.shells import tub
+from jaxshape.data.procedural.draw import Draw, Number, Range
+from jaxshape.data.procedural.primitives import (
     Part,
     bars,
     both_sides,
@@ -17,7 +18,6 @@ from jaxshape.data.chairs.primitives import (
     superellipse,
     tilt,
 )
-from jaxshape.data.chairs.shells import tub
 
 
 def feet(draw: Draw, width: Number, depth: float, height: float) -> list[Part]:

@@ -5,7 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-MAX_FACES = 20_000_000
+from jaxshape.limits import MESH_FACES
+
+MAX_FACES = MESH_FACES
 """Most triangles of one mesh, counted over all its instances in a scene."""
 
 

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxshape import limits
 from jaxshape.data.sequences import (
     arrays,
     bop,
@@ -115,16 +116,17 @@ def open_sequence(
     Raises:
         SequenceError: No layout fits, files are missing, or the intrinsics do not fit the images.
     """
-    if depth_scale is not None and not depth_scale > 0:
-        raise SequenceError(
-            f"The depth scale is {depth_scale}; expected the number of depth units in a metre, "
-            "which is positive: 1000 for millimetres."
-        )
     contents = _contents_of(Path(path))
     name = _layout_of(contents) if layout is None else _checked_layout(layout)
     listed = LAYOUTS[name].list_frames(contents)
     if not listed.files:
         raise SequenceError(_nothing_fits(contents))
+    scale = float(listed.depth_scale if depth_scale is None else depth_scale)
+    if not 1e-9 < scale < 1e9:
+        raise SequenceError(
+            f"The depth scale is {scale:g}; expected the number of depth units in a metre, which "
+            "is positive: 1000 for millimetres."
+        )
     shape = _shape_of(listed)
     camera, cameras, doubts = _cameras(contents, listed, shape)
     has_poses, is_guess = listed.read_pose is not None, bool(doubts)
@@ -140,7 +142,7 @@ def open_sequence(
         read_pose=listed.read_pose or _no_pose,
         has_poses=has_poses,
         shape=shape,
-        depth_scale=float(depth_scale or listed.depth_scale),
+        depth_scale=scale,
         times=listed.times,
         color_delays=listed.color_delays,
         findings=listed.findings + doubts + remarks,
@@ -218,8 +220,8 @@ def _shape_of(listed: Listed) -> tuple[int, int]:
     """Height and width of the first depth image whose header can be read."""
     for files in listed.files[:20]:
         with suppress(SequenceError):
-            return read_shape(files.depth)
-    return read_shape(listed.files[0].depth)  # raises what is wrong with it
+            return read_shape(files.depth, limits.DEPTH_PIXELS)
+    return read_shape(listed.files[0].depth, limits.DEPTH_PIXELS)  # raises what is wrong with it
 
 
 def _cameras(

@@ -1,18 +1,15 @@
 """One `.npz` file of arrays: depth, and perhaps colour, cameras, poses, masks and times."""
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from jaxshape import reading
 from jaxshape.data.sequences.cameras import Calibration
 from jaxshape.data.sequences.frames import FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import Contents, Listed
 from jaxshape.data.sequences.poses import known
 from jaxshape.data.sequences.rasters import Stored
-
-MAX_BYTES = 4 * 2**30
-"""Size up to which the arrays of a file are read, all together."""
 
 _NAMES = {
     "depth": ("depth", "depths"),
@@ -46,6 +43,8 @@ def list_frames(contents: Contents) -> Listed:
         raise SequenceError(f"{path} holds no array called depth; expected depth [n h w]: add it.")
     depth = arrays["depth"]
     depth = depth[None] if depth.ndim == 2 else depth
+    if depth.ndim not in (3, 4) or depth.size == 0:
+        raise SequenceError(f"{path} holds depth of shape {depth.shape}; expected [n h w].")
     count = len(depth)
     per_frame = {
         name: _of_frames(arrays.get(name), depth.shape, wanted, path, name)
@@ -70,9 +69,13 @@ def list_frames(contents: Contents) -> Listed:
         ),
         depth_scale=1.0 if depth.dtype.kind == "f" else 1000.0,
         read_pose=None if poses is None else lambda i: known(poses[i], f"{path}: pose {i}"),
-        times=times if times is not None and (np.diff(times) > 0).all() else None,
+        times=times if times is not None and _rises(times) else None,
         calibration=None if K is None else _calibration(K, path),
     )
+
+
+def _rises(times: np.ndarray) -> bool:
+    return bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
 
 
 def _calibration(K: np.ndarray, path: Path) -> Calibration:
@@ -115,39 +118,18 @@ def _checked(
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays that are used, by the first of their names; nothing pickled is loaded."""
+    """The arrays that are used, by the first of their names."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            sizes = {
-                one.filename.removesuffix(".npy"): _size(archive, one) for one in archive.infolist()
-            }
+        there = reading.array_names(path)
         chosen = {
-            kind: next(name for name in names if name in sizes)
+            kind: next(name for name in names if name in there)
             for kind, names in _NAMES.items()
-            if not sizes.keys().isdisjoint(names)
+            if not there.isdisjoint(names)
         }
-        if (total := sum(sizes[name] for name in chosen.values())) > MAX_BYTES:
-            raise ValueError(f"its arrays have {total / 2**30:.1f} GB, more than 4")
-        with np.load(path, allow_pickle=False) as file:
-            return {kind: file[name] for kind, name in chosen.items()}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        found = reading.read_arrays(path, chosen.values())
+    except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} cannot be read ({error}); expected a file of numpy.savez with depth [n h w] "
             "and K: write it again."
         ) from error
-
-
-def _size(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """Bytes that an array says it has; `ValueError` if it is not one, or holds fewer."""
-    if not member.filename.endswith(".npy"):
-        return 0
-    with archive.open(member) as stream:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0
-        if version != (1, 0):
-            read = np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    size = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    if size > member.file_size:
-        raise ValueError(f"{member.filename} promises {size} bytes and holds fewer")
-    return size
+    return {kind: found[name] for kind, name in chosen.items()}

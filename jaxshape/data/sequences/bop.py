@@ -74,7 +74,8 @@ def _entry(image: Any, name: str) -> Any:
 def _depth_scale(images: list[Any], source: Path) -> float:
     """Depth units in a metre, from the millimetres in a unit, which all images have to share."""
     units = {
-        float(matrix_of(one.get("depth_scale", 1.0), (), source, "depth_scale")) for one in images
+        float(matrix_of(_entry(one, "depth_scale") or 1.0, (), source, "depth_scale"))
+        for one in images
     }
     if len(units) != 1 or not all(np.isfinite(unit) and unit > 0 for unit in units):
         raise SequenceError(

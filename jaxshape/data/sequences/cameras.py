@@ -5,7 +5,6 @@ Ours put the centre of pixel (row, column) at (column + 0.5, row + 0.5); so does
 TUM, Open3D, Redwood and `cam_K.txt`, put it at (column, row), so theirs get half a pixel more.
 """
 
-import json
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -14,9 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxshape import reading
+from jaxshape.data.sequences.documents import shape_of
 from jaxshape.data.sequences.frames import Finding, SequenceError, same_aspect, size
 from jaxshape.data.sequences.poses import read_matrix
-from jaxshape.data.sequences.text import read_text, words_of
+from jaxshape.data.sequences.text import words_of
 
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -99,7 +100,7 @@ def scaled_cameras(calibration: Calibration, shape: tuple[int, int]) -> Float[np
             f"images are {size(shape)}; expected the camera of the depth images: write theirs to "
             "cam_K.txt, and remove it."
         )
-    scaled = np.diag([shape[1] / width, shape[0] / height, 1.0]) @ calibration.matrices
+    scaled = _scaled(calibration.matrices, (height, width), shape)
     return np.stack([_checked(K, calibration.source, shape) for K in scaled])
 
 
@@ -156,7 +157,7 @@ def _read_opencv(path: Path) -> Matrix:
 def _read_numbers(path: Path) -> Matrix:
     """The first four numbers of a file, as ETH3D's SLAM benchmark writes them."""
     try:
-        words = [word for _, line in words_of(read_text(path)) for word in line]
+        words = [word for _, line in words_of(reading.read_text(path)) for word in line]
         fx, fy, cx, cy = map(float, words[:4])
     except (OSError, ValueError) as error:
         raise SequenceError(
@@ -175,25 +176,33 @@ _FILES: dict[str, Callable[[Path], Matrix]] = {
 def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
     """Open3D's PinholeCameraIntrinsic, or the first of a trajectory; None if it is neither."""
     try:
-        content: Any = json.loads(read_text(path))
+        content = reading.read_json(path)
         if "parameters" in content:
             content = next(iter(content["parameters"]), {}).get("intrinsic", {})
         if "intrinsic_matrix" not in content:
             return None
-        K = np.array(content["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
-        height, width = int(content.get("height", shape[0])), int(content.get("width", shape[1]))
+        K = reading.numbers_of(content["intrinsic_matrix"], (3, 3)).T
+        height, width = content.get("height", shape[0]), content.get("width", shape[1])
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise SequenceError(
             f"{path} cannot be read as a camera ({type(error).__name__}: {error}); expected "
             "Open3D's JSON with width, height and intrinsic_matrix by columns: write it again."
         ) from error
+    height, width = shape_of(height, width, path)
     if not same_aspect((height, width), shape):
         raise SequenceError(
             f"{path} is of images of {width} x {height}, and the depth images are {size(shape)}; "
             "expected the camera of the depth images: write theirs."
         )
     K[:2, 2] += 0.5
-    return np.diag([shape[1] / width, shape[0] / height, 1.0]) @ K
+    return _scaled(K, (height, width), shape)
+
+
+def _scaled(
+    K: Float[np.ndarray, "*n 3 3"], of: tuple[int, int], shape: tuple[int, int]
+) -> Float[np.ndarray, "*n 3 3"]:
+    """Cameras of images of a size, for images of another; what is not finite stays so."""
+    return np.array([[shape[1] / of[1]], [shape[0] / of[0]], [1.0]]) * K
 
 
 def _checked(K: Matrix, path: Path | str, shape: tuple[int, int]) -> Matrix:
@@ -203,6 +212,12 @@ def _checked(K: Matrix, path: Path | str, shape: tuple[int, int]) -> Matrix:
         raise SequenceError(
             f"{path} has focal lengths {fx:g}, {fy:g} and last row {K[2].tolist()}; "
             "expected positive focal lengths in pixels and 0 0 1: write fx 0 cx / 0 fy cy / 0 0 1."
+        )
+    if not 0.05 < min(fx, fy) / max(h, w) <= max(fx, fy) / max(h, w) < 100:
+        raise SequenceError(
+            f"{path} has focal lengths {fx:g}, {fy:g}, with which images of {size(shape)} pixels "
+            "would be wider than 160 degrees or narrower than 1: expected them in pixels; write "
+            "fx 0 cx / 0 fy cy / 0 0 1."
         )
     # Within the middle 90 %, since a matrix for images of twice the size puts it at the corner.
     if not all(0.05 < c / n < 0.95 for c, n in ((cx, w), (cy, h))):

@@ -1,6 +1,5 @@
 """Text that comes with a recording, and the files it names: bounded, and inside the recording."""
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -8,21 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxshape import limits, reading
 from jaxshape.data.sequences.errors import SequenceError
-from jaxshape.data.sequences.text import number, read_text, words_of
-
-MAX_BYTES = 256 * 2**20
-"""Size up to which a text file is read; an hour of poses takes a tenth of it."""
+from jaxshape.data.sequences.text import number, words_of
 
 
-def read_bounded(path: Path) -> str:
-    """Read a text, as `read_text`; `SequenceError` if it is no regular file, large, or binary."""
+def read_document(path: Path) -> str:
+    """Read a text, as `reading.read_text`; `SequenceError` if that cannot be done."""
     try:
-        if not path.is_file():
-            raise ValueError("it is missing, or not a regular file")
-        if (size := path.stat().st_size) > MAX_BYTES:
-            raise ValueError(f"it has {size / 2**20:.0f} MB, more than {MAX_BYTES / 2**20:.0f}")
-        return read_text(path)
+        return reading.read_text(path)
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} cannot be read ({error}); expected a text file: copy it again from its source."
@@ -31,17 +24,13 @@ def read_bounded(path: Path) -> str:
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds one object; `SequenceError` if it holds anything else."""
-    text = read_bounded(path)
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        return reading.read_json_object(path)
+    except (OSError, ValueError) as error:
         raise SequenceError(
-            f"{path} is not JSON ({error}); expected a whole JSON file: copy it again from its "
-            "source."
+            f"{path} cannot be read as JSON ({error}); expected a whole JSON file with one object: "
+            "copy it again from its source."
         ) from error
-    if not isinstance(content, dict):
-        raise SequenceError(f"{path} holds a JSON {type(content).__name__}; expected an object.")
-    return content
 
 
 def matrix_of(
@@ -49,14 +38,23 @@ def matrix_of(
 ) -> Float[np.ndarray, "..."]:
     """Numbers from a JSON file as an array of a shape; `SequenceError` if they do not fill it."""
     try:
-        if any(one is None for one in np.array(value, dtype=object).ravel()):
-            raise ValueError("it is missing")
-        return np.array(value, dtype=np.float64).reshape(shape)
-    except (ValueError, TypeError, OverflowError) as error:
-        wanted = " x ".join(map(str, shape))
+        return reading.numbers_of(value, shape)
+    except ValueError as error:
+        wanted = " x ".join("n" if size < 0 else str(size) for size in shape) or "1"
         raise SequenceError(
             f"{source} gives no usable {name} ({error}); expected {wanted} numbers: write it again."
         ) from error
+
+
+def shape_of(height: Any, width: Any, source: object) -> tuple[int, int]:
+    """Height and width of images from a JSON file; `SequenceError` if no image has them."""
+    sides = matrix_of([height, width], (2,), source, "height and width")
+    if not ((sides >= 1) & (sides <= limits.IMAGE_SIDE) & (np.trunc(sides) == sides)).all():
+        raise SequenceError(
+            f"{source} is of images of {sides[1]:g} x {sides[0]:g} pixels; expected whole numbers "
+            f"from 1 to {limits.IMAGE_SIDE}: write their width and height."
+        )
+    return int(sides[0]), int(sides[1])
 
 
 def rows_of(path: Path, columns: Iterable[int]) -> list[list[float]]:
@@ -66,7 +64,7 @@ def rows_of(path: Path, columns: Iterable[int]) -> list[list[float]]:
     """
     wanted = tuple(columns)
     rows = []
-    for line, words in words_of(read_bounded(path)):
+    for line, words in words_of(read_document(path)):
         try:
             row = [number(word) for word in words]
         except ValueError as error:
@@ -87,10 +85,16 @@ def below(folder: Path, name: Any, source: Path) -> Path:
 
     Links are followed first, so that a recording cannot have a file read that is not its own.
     """
-    if not isinstance(name, str) or "\0" in name:
-        raise SequenceError(f"{source} names the file {name!r}; expected a path, relative to it.")
+    if not isinstance(name, str) or "\0" in name or len(name) > limits.PATH_LENGTH:
+        raise SequenceError(
+            f"{source} names the file {str(name)[:60]!r}; expected a path, relative to it."
+        )
     path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        is_below = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a name that is too long, or links in a circle
+        is_below = False
+    if not is_below:
         raise SequenceError(
             f"{source} names the file {name!r}, which lies outside of {folder}; expected a file "
             "below it: copy it there."

@@ -1,5 +1,6 @@
 """Figures of a recording: of its poses, names and times, and of some of its images."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -83,7 +84,7 @@ def depths_of(sequence: Sequence) -> Depths:
     raw, damaged = [], []
     for index in _sampled(sequence):
         try:
-            raw.append(read_raw_depth(sequence.files[index].depth, sequence.shape))
+            raw.append(_thinned(read_raw_depth(sequence.files[index].depth, sequence.shape)))
         except SequenceError as error:
             damaged.append(error)
     if not raw:
@@ -98,6 +99,12 @@ def depths_of(sequence: Sequence) -> Depths:
         black=int(np.sum(~valid.any(axis=(1, 2)))),
         damaged=tuple(map(str, damaged)),
     )
+
+
+def _thinned(pixels: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Every n-th pixel of an image, a million at most: figures need no more."""
+    every = math.ceil(math.sqrt(pixels.size / 1e6))
+    return pixels[::every, ::every].copy()
 
 
 def poses_of(sequence: Sequence, reading: Reading) -> Poses:
@@ -141,7 +148,7 @@ def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:
     names = sequence.names
     steps = np.diff(_numbers(names) if sequence.times is None else sequence.times)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    if usual <= 0:  # names that do not count
+    if usual < 1e-9:  # names that do not count
         return ()
     return tuple(
         Gap(names[i], names[i + 1], max(1, round(steps[i] / usual) - 1))
@@ -158,7 +165,7 @@ def rate_of(sequence: Sequence) -> float | None:
     """Depth images a second; None without times."""
     steps = np.diff(sequence.times) if sequence.times is not None else np.zeros(0)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    return 1 / usual if usual > 0 else None
+    return 1 / usual if usual >= 1e-9 else None
 
 
 def _sampled(sequence: Sequence) -> list[int]:

@@ -1,6 +1,5 @@
 """Layouts with a folder for each kind of image: Redwood object scans, BundleSDF, Open3D."""
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxshape import reading
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
 from jaxshape.data.sequences.frames import (
     Finding,
@@ -27,7 +27,7 @@ from jaxshape.data.sequences.listing import (
     with_colors_by_time,
 )
 from jaxshape.data.sequences.poses import StoredByColumns, known, read_pose
-from jaxshape.data.sequences.text import read_text, words_of
+from jaxshape.data.sequences.text import words_of
 from jaxshape.data.sequences.trajectories import read_unchecked
 
 MILLIMETRES = 1000.0
@@ -193,8 +193,8 @@ def _find_trajectory(contents: Contents) -> Path | None:
 
 def _is_log(path: Path) -> bool:
     try:
-        first = next(iter(words_of(read_text(path))), (0, []))[1]
-    except ValueError:
+        first = next(iter(words_of(reading.read_text(path))), (0, []))[1]
+    except (OSError, ValueError):
         return False
     return len(first) == 3 and all(re.fullmatch(r"-?\d+", word) for word in first)
 
@@ -203,6 +203,6 @@ def _is_json_trajectory(path: Path) -> bool:
     if "traj" in path.name.lower():  # if it is none, its reader says what is wrong with it
         return True
     try:
-        return "parameters" in json.loads(read_text(path))
-    except (ValueError, TypeError):
+        return "parameters" in reading.read_json_object(path)
+    except (OSError, ValueError):
         return False

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
+from jaxshape import limits
 from jaxshape.data.sequences.errors import SequenceError as SequenceError
 from jaxshape.data.sequences.rasters import Picture, open_picture
 
@@ -193,7 +194,7 @@ def read_depth(
 
 def read_raw_depth(path: Picture, shape: tuple[int, int]) -> Float[np.ndarray, "h w"]:
     """Read the numbers of a depth image of 16 bits or of floats, in its own units."""
-    with opened(path) as image:
+    with opened(path, limits.DEPTH_PIXELS) as image:
         if (image.height, image.width) != shape:
             raise SequenceError(
                 f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the first depth "
@@ -210,7 +211,8 @@ def read_raw_depth(path: Picture, shape: tuple[int, int]) -> Float[np.ndarray, "
 def usual_depth_scale(pictures: Iterable[Picture]) -> float:
     """Depth units in a metre where nothing says them: floats are metres, integers millimetres."""
     for picture in islice(pictures, 20):
-        with suppress(SequenceError), opened(picture) as image:  # a damaged one says nothing
+        # A damaged one says nothing.
+        with suppress(SequenceError), opened(picture, limits.DEPTH_PIXELS) as image:
             return 1.0 if image.mode == "F" else 1000.0
     return 1000.0
 
@@ -260,7 +262,8 @@ def read_color(path: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 
     """Read a colour image, scaled to `shape`; `SequenceError` if damaged or of another aspect."""
     with opened(path) as image:
         _check_aspect(image, shape, path)
-        scaled = image.convert("RGB").resize((shape[1], shape[0]), Image.Resampling.BILINEAR)
+        color = image if image.mode == "RGB" else image.convert("RGB")
+        scaled = color.resize((shape[1], shape[0]), Image.Resampling.BILINEAR)
     return np.array(scaled)
 
 
@@ -291,23 +294,24 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 @contextmanager
-def opened(path: Picture) -> Iterator[Image.Image]:
-    """Open an image for the block that decodes it; `SequenceError` if it is damaged."""
+def opened(path: Picture, most: int = limits.COLOR_PIXELS) -> Iterator[Image.Image]:
+    """Open an image of up to `most` pixels for the block that decodes it; `SequenceError` if it is
+    damaged or larger."""
     try:
-        with open_picture(path) as image:
+        with open_picture(path, most) as image:
             yield image
-    except SequenceError:
+    except (SequenceError, MemoryError):
         raise
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except Exception as error:  # decoders of damaged files fail in any way there is
         raise SequenceError(
             f"{path} cannot be read as an image ({error}); expected a whole image file: copy it "
             "again from its source, or remove the frame."
         ) from error
 
 
-def read_shape(path: Picture) -> tuple[int, int]:
-    """Height and width of an image, from its header alone."""
-    with opened(path) as image:
+def read_shape(path: Picture, most: int = limits.COLOR_PIXELS) -> tuple[int, int]:
+    """Height and width of an image of up to `most` pixels, from its header alone."""
+    with opened(path, most) as image:
         return image.height, image.width
 
 

@@ -14,7 +14,7 @@ from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
 from jaxshape.data.sequences.poses import NEAR
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".npy", ".exr")
-COLOR_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".ppm")
+COLOR_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".ppm")
 
 DEPTH_FOLDERS = ("depth", "depths", "Depth", "aligned_depth_to_color")
 COLOR_FOLDERS = ("color", "image", "rgb", "colors", "images", "Color", "RGB")
@@ -27,11 +27,13 @@ class Contents(NamedTuple):
         folder: The folder.
         files: Names of its files.
         folders: Names of its sub-folders.
+        others: Names of what is neither, as pipes, devices and links to nothing; none is opened.
     """
 
     folder: Path
     files: frozenset[str]
     folders: frozenset[str]
+    others: frozenset[str] = frozenset()
 
 
 class Listed(NamedTuple):
@@ -61,12 +63,21 @@ class Listed(NamedTuple):
 
 def list_folder(folder: Path) -> Contents:
     """List a folder; hidden entries are left out."""
-    files, folders = [], []
+    files, folders, others = [], [], []
     with os.scandir(folder) as entries:
         for entry in entries:
             if not entry.name.startswith("."):
-                (folders if entry.is_dir() else files).append(entry.name)
-    return Contents(folder, frozenset(files), frozenset(folders))
+                (folders if _is(entry.is_dir) else files if _is(entry.is_file) else others).append(
+                    entry.name
+                )
+    return Contents(folder, frozenset(files), frozenset(folders), frozenset(others))
+
+
+def _is(asked: Callable[[], bool]) -> bool:
+    try:
+        return asked()
+    except OSError:  # links in a circle
+        return False
 
 
 def files_in(
@@ -77,7 +88,8 @@ def files_in(
     for name in names:
         if name in contents.folders:
             folder = contents.folder / name
-            found = (os.path.splitext(file) for file in list_folder(folder).files)
+            inside = list_folder(folder)  # reading says what is wrong with the others
+            found = (os.path.splitext(file) for file in inside.files | inside.others)
             chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
             return {stem: folder / (stem + end) for stem, end in sorted(chosen, key=_natural)}
     return {}
@@ -111,7 +123,7 @@ def mask_images(contents: Contents) -> dict[str, Path]:
 
 
 def numbers_in(name: str) -> tuple[int, ...]:
-    return tuple(int(digits) for digits in re.findall(r"\d+", name))
+    return tuple(int(digits[-18:]) for digits in re.findall(r"\d+", name))
 
 
 def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | None]:

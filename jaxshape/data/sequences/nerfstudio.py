@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
-from jaxshape.data.sequences.documents import below, matrix_of, read_json_object
+from jaxshape.data.sequences.documents import below, matrix_of, read_json_object, shape_of
 from jaxshape.data.sequences.frames import (
     Finding,
     FrameFiles,
@@ -27,6 +27,7 @@ from jaxshape.data.sequences.poses import from_opengl, known
 
 _SOURCE = "transforms.json"
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_CAMERA = ("h", "w", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
 
 
 def fits(contents: Contents) -> bool:
@@ -52,11 +53,13 @@ def list_frames(contents: Contents) -> Listed:
     files = [_files(contents.folder, frames[i], depth[i], source) for i in kept]
     frames = [frames[i] for i in kept]
     scale = float(matrix_of(about.get("applied_scale", 1.0), (), source, "applied_scale"))
+    if not 1e-9 < scale < 1e9:
+        raise SequenceError(f"{source} gives applied_scale {scale:g}; expected one above 0.")
 
     def read(index: int) -> Float[np.ndarray, "4 4"] | None:
-        T = np.eye(4)
-        rows = matrix_of(frames[index].get("transform_matrix"), (-1, 4), source, "transform_matrix")
-        T[: len(rows)] = rows[:4]
+        T, given = np.eye(4), frames[index].get("transform_matrix")
+        count = 3 if isinstance(given, list) and len(given) == 3 else 4
+        T[:count] = matrix_of(given, (count, 4), source, "transform_matrix")
         T[:3, 3] /= scale
         return known(from_opengl(T), f"The pose of {files[index].name} in {source}")
 
@@ -73,6 +76,9 @@ def _frames(about: dict[str, Any], source: Path) -> list[dict[str, Any]]:
     frames = about.get("frames")
     if not isinstance(frames, list) or not all(isinstance(one, dict) for one in frames):
         raise SequenceError(f"{source} holds no list of frames; write it again.")
+    for name in (one.get("file_path") for one in frames):
+        if name is not None:
+            below(source.parent, name, source)  # refuses what is none
     return frames
 
 
@@ -126,7 +132,7 @@ def _calibration(
     about: dict[str, Any], frames: list[dict[str, Any]], files: list[FrameFiles], source: Path
 ) -> Calibration:
     """The camera of each frame, whose entries go before those of the whole file."""
-    entries = [about | frame for frame in frames]
+    entries = [{name: one.get(name, about.get(name)) for name in _CAMERA} for one in frames]
     shape = _shape(entries, files, source)
     numbers = np.array([_numbers(entry, shape, source) for entry in entries])
     if (numbers == numbers[0]).all():
@@ -135,18 +141,14 @@ def _calibration(
 
 
 def _shape(entries: list[dict[str, Any]], files: list[FrameFiles], source: Path) -> tuple[int, int]:
-    shapes = {(one.get("h"), one.get("w")) for one in entries}
+    given = [(one["h"], one["w"]) for one in entries]
+    shapes = {None if None in sides else shape_of(*sides, source) for sides in given}
     if len(shapes) > 1:
         raise SequenceError(
             f"{source} has images of {len(shapes)} sizes; expected one size: scale the images and "
             "their cameras."
         )
-    h, w = shapes.pop()
-    if h is None or w is None:
-        first = files[0].color or files[0].depth
-        return read_shape(first)
-    height, width = matrix_of([h, w], (2,), source, "w and h")
-    return int(height), int(width)
+    return shapes.pop() or read_shape(files[0].color or files[0].depth)
 
 
 def _numbers(entry: dict[str, Any], shape: tuple[int, int], source: Path) -> list[float]:
@@ -155,9 +157,10 @@ def _numbers(entry: dict[str, Any], shape: tuple[int, int], source: Path) -> lis
     fx, fy = entry.get("fl_x"), entry.get("fl_y")
     if fx is None and entry.get("camera_angle_x") is not None:
         angle = float(matrix_of(entry["camera_angle_x"], (), source, "camera_angle_x"))
-        fx = w / (2 * np.tan(angle / 2))
+        fx = w / (2 * np.tan(angle / 2)) if 0 < angle < np.pi else None
     fy = fx if fy is None else fy
-    center = entry.get("cx", w / 2), entry.get("cy", h / 2)
+    cx, cy = entry.get("cx"), entry.get("cy")
+    center = w / 2 if cx is None else cx, h / 2 if cy is None else cy
     return matrix_of([fx, fy, *center], (4,), source, "fl_x, fl_y, cx, cy").tolist()
 
 

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation, Slerp
 
+from jaxshape import limits, reading
 from jaxshape.data.sequences.frames import SequenceError
-from jaxshape.data.sequences.text import number, read_text, words_of
+from jaxshape.data.sequences.text import number, words_of
 
 READABLE_GAP = 0.1
 """Seconds between two poses within which the camera's way is taken as straight."""
@@ -35,7 +36,7 @@ def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
     Comments and commas are passed over.
     """
     try:
-        rows = [[number(word) for word in words] for _, words in words_of(read_text(path))]
+        rows = [[number(word) for word in words] for _, words in words_of(reading.read_text(path))]
         if [len(row) for row in rows] != [size] * size:
             raise ValueError(f"its lines hold {[len(row) for row in rows]} numbers")
         matrix = np.array(rows, dtype=np.float64)
@@ -68,7 +69,7 @@ def known(T: Float[np.ndarray, "4 4"], source: object) -> Float[np.ndarray, "4 4
 def is_rigid(T: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "*batch"]:
     """Whether matrices are rigid motions, within what eight digits and rounding leave."""
     R = T[..., :3, :3]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         last = np.abs(T[..., 3, :] - (0, 0, 0, 1)).max(axis=-1) <= 1e-6
         orthonormal = _stretch(R) <= 1e-2
         return np.asarray(last & orthonormal & (np.linalg.det(R) > 0))
@@ -77,6 +78,11 @@ def is_rigid(T: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "*batch"]:
 def check_rigid(T: Float[np.ndarray, "4 4"], source: object) -> None:
     """Raise `SequenceError`, naming `source`, unless a matrix is a rigid motion."""
     if is_rigid(T):
+        if (far := float(np.abs(T[:3, 3]).max())) > limits.FAR:
+            raise SequenceError(
+                f"{source} lies {far:.3g} from the origin; expected metres, {limits.FAR:g} at "
+                "most: write it again."
+            )
         return
     if is_rigid(T.T):
         raise StoredByColumns(
@@ -102,7 +108,8 @@ def check_rigid(T: Float[np.ndarray, "4 4"], source: object) -> None:
 
 
 def _stretch(R: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
-    return np.asarray(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-2, -1)))
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.asarray(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-2, -1)))
 
 
 def poses_at(
@@ -147,7 +154,8 @@ def from_quaternions(
     """Poses from places and quaternions x y z w; NaN where they are not finite."""
     T = np.full((len(places), 4, 4), np.nan)
     finite = np.isfinite(places).all(axis=1) & np.isfinite(quaternions).all(axis=1)
-    lengths = np.linalg.norm(quaternions, axis=1)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(quaternions, axis=1)
     if (bad := np.flatnonzero(finite & (np.abs(lengths - 1) > 1e-2))).size:
         raise SequenceError(
             f"{source}: pose {bad[0]} has a quaternion of length {lengths[bad[0]]:.3g}; expected "

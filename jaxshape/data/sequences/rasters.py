@@ -1,15 +1,19 @@
-"""Images that Pillow does not read: arrays of `.npy` and `.npz` files, and EXR."""
+"""Image files of a few formats, and arrays that are images: bounded before they are decoded."""
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
+from jaxshape import limits, reading
 from jaxshape.data.sequences.errors import SequenceError
 
-MAX_PIXELS = 64_000_000
-"""Pixels up to which an image is decoded."""
+FORMATS = ("PNG", "JPEG", "TIFF", "PPM")
+"""Formats that Pillow may decode, PGM among the last; those that start other programs are not."""
 
 
 class Stored(NamedTuple):
@@ -31,25 +35,43 @@ Picture = Path | Stored
 """Where an image is: a file of its own, or an array."""
 
 
-def open_picture(picture: Picture) -> Image.Image:
-    """Open an image of any kind; raises `OSError`, `ValueError` or `SyntaxError` if damaged."""
+@contextmanager
+def open_picture(picture: Picture, most: int) -> Iterator[Image.Image]:
+    """Open an image of any kind for the block that decodes it.
+
+    Args:
+        picture: The image.
+        most: Pixels that it may have.
+
+    Raises:
+        OSError: It cannot be opened.
+        ValueError: It is damaged, not a regular file, or larger.
+        SequenceError: It is an EXR image, and what reads them is not installed.
+    """
     if isinstance(picture, Stored):
-        return _from_array(picture.pixels)
-    if not picture.is_file():
-        raise OSError("it is missing, or not a regular file")
-    read = {".npy": _read_npy, ".exr": _read_exr}.get(picture.suffix.lower())
-    image = Image.open(picture) if read is None else _from_array(read(picture))
-    if image.width * image.height > MAX_PIXELS:
-        raise ValueError(f"it has {image.width} x {image.height} pixels")
-    return image
+        yield _from_array(picture.pixels, most)
+        return
+    suffix = picture.suffix.lower()
+    with reading.opened(picture, limits.IMAGE_BYTES) as file:
+        if suffix == ".exr":
+            yield _from_array(_read_exr(picture, most), most)
+        elif suffix == ".npy":  # mapped, so that a header that promises more takes no memory
+            yield _from_array(np.load(picture, mmap_mode="r", allow_pickle=False), most)
+        else:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", module="PIL")  # what matters is an error
+                with Image.open(file, formats=FORMATS) as image:
+                    image.filename = str(picture)
+                    _check_size(image.width, image.height, most)
+                    yield image
 
 
-def _read_npy(path: Path) -> np.ndarray:
-    # Mapped, so that a header that promises more than the file holds is refused before memory is.
-    return np.load(path, mmap_mode="r", allow_pickle=False)
+def _check_size(width: int, height: int, most: int) -> None:
+    if not 0 < width * height <= most:
+        raise ValueError(f"it has {width} x {height} pixels; {most:,} at most are read")
 
 
-def _from_array(array: Any) -> Image.Image:
+def _from_array(array: Any, most: int) -> Image.Image:
     """An image of a depth map, a mask or colours; other numbers than bytes and 16 bit as floats."""
     array = np.asarray(array)
     if array.ndim == 3 and array.shape[0] == 1:
@@ -58,18 +80,18 @@ def _from_array(array: Any) -> Image.Image:
         array = array[..., 0]
     if array.ndim != 2 and not (array.ndim == 3 and array.shape[2] == 3) or array.size == 0:
         raise ValueError(f"it is an array of shape {array.shape}, not of an image")
-    if array.shape[0] * array.shape[1] > MAX_PIXELS:
-        raise ValueError(f"it has {array.shape[1]} x {array.shape[0]} pixels")
+    _check_size(array.shape[1], array.shape[0], most)
     if array.dtype == bool:
         return Image.fromarray(array.astype(np.uint8) * 255)
     if array.dtype not in (np.uint8, np.uint16):
         if array.dtype.kind not in "iuf":
             raise ValueError(f"it is an array of {array.dtype}, not of numbers")
-        array = array.astype(np.float32)
+        with np.errstate(over="ignore"):
+            array = array.astype(np.float32)
     return Image.fromarray(np.ascontiguousarray(array))
 
 
-def _read_exr(path: Path) -> np.ndarray:
+def _read_exr(path: Path, most: int) -> np.ndarray:
     """The depth channel of an EXR file: Z, Y, R or the only one."""
     try:
         import OpenEXR  # type: ignore[import-not-found]
@@ -78,11 +100,14 @@ def _read_exr(path: Path) -> np.ndarray:
             f"{path} is an EXR image, which needs a package of its own to be read: pip install "
             "'jaxshape[exr]', or save the depth images as 16-bit PNG in millimetres."
         ) from None
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.array(one.pixels) for name, one in file.channels().items()}
-    except (RuntimeError, TypeError) as error:
-        raise ValueError(str(error)) from error
+    with OpenEXR.File(str(path), header_only=True) as file:
+        header = file.header()
+        (left, top), (right, bottom) = (map(int, corner) for corner in header["dataWindow"])
+        if len(header["channels"]) > limits.IMAGE_CHANNELS:
+            raise ValueError(f"it has {len(header['channels'])} channels")
+    _check_size(right - left + 1, bottom - top + 1, most)
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {name: np.array(one.pixels) for name, one in file.channels().items()}
     for name in ("Z", "Y", "R", *channels):
         if name in channels:
             return channels[name]

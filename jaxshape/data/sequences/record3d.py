@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
-from jaxshape.data.sequences.documents import matrix_of, read_json_object
+from jaxshape.data.sequences.documents import matrix_of, read_json_object, shape_of
 from jaxshape.data.sequences.frames import SequenceError, usual_depth_scale
 from jaxshape.data.sequences.listing import (
     Contents,
@@ -75,8 +75,7 @@ def list_frames(contents: Contents) -> Listed:
 
 
 def _calibration(about: dict[str, Any], numbers: list[int], source: Path) -> Calibration:
-    h, w = matrix_of([about.get("h"), about.get("w")], (2,), source, "w and h")
-    shape = int(h), int(w)
+    shape = shape_of(about.get("h"), about.get("w"), source)
     if own := about.get("perFrameIntrinsicCoeffs"):
         numbers_of = matrix_of(own, (-1, 4), source, "perFrameIntrinsicCoeffs")
         if 0 <= min(numbers) and max(numbers) < len(numbers_of):

@@ -6,7 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
-from jaxshape.data.sequences.documents import matrix_of, read_bounded, read_json_object, rows_of
+from jaxshape.data.sequences.documents import (
+    matrix_of,
+    read_document,
+    read_json_object,
+    rows_of,
+    shape_of,
+)
 from jaxshape.data.sequences.frames import SequenceError
 from jaxshape.data.sequences.listing import (
     COLOR_SUFFIXES,
@@ -42,7 +48,7 @@ def _poses(contents: Contents) -> Path | None:
 
 def _is_matrices(path: Path) -> bool:
     """Whether a file has 16 numbers on its first line, unlike a trajectory of TUM's."""
-    return len(read_bounded(path).lstrip().split("\n", 1)[0].split()) == 16
+    return len(read_document(path).lstrip().split("\n", 1)[0].split()) == 16
 
 
 def list_frames(contents: Contents) -> Listed:
@@ -87,7 +93,7 @@ def _calibration(contents: Contents) -> tuple[Calibration | None, float]:
             if not (np.isfinite(scale) and scale > 0):
                 raise SequenceError(f"{source} gives the scale {scale:g}; expected one above 0.")
             K = matrices_of(fx, fy, cx + 0.5, cy + 0.5)
-            return Calibration(K, (int(h), int(w)), source.name), scale
+            return Calibration(K, shape_of(h, w, source), source.name), scale
     if "cam_K.txt" in contents.files:
         return None, _SCALE
     return Calibration(matrices_of(*_CAMERA), _SHAPE, "NICE-SLAM's camera for Replica"), _SCALE

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
-from jaxshape.data.sequences.documents import read_bounded, rows_of
+from jaxshape.data.sequences.documents import read_document, rows_of
 from jaxshape.data.sequences.frames import Finding, SequenceError, read_shape
 from jaxshape.data.sequences.listing import (
     Contents,
@@ -24,6 +24,9 @@ from jaxshape.data.sequences.poses import from_quaternions, known
 
 _FILM = (1440, 1920)
 """Height and width of the film, of which the camera is."""
+
+MAX_COLUMNS = 100
+"""Columns of the table that are read."""
 
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _OWN_CAMERA = ("fx", "fy", "cx", "cy")
@@ -68,8 +71,13 @@ def list_frames(contents: Contents) -> Listed:
 
 def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
     """The columns of the table by their names; NaN where a cell is empty."""
-    lines = list(csv.reader(read_bounded(path).splitlines()))
-    names = [name.strip() for name in lines[0]] if lines else []
+    try:
+        lines = list(csv.reader(read_document(path).splitlines()))
+    except csv.Error as error:
+        raise SequenceError(
+            f"{path} is not a table ({error}); export the recording again."
+        ) from error
+    names = [name.strip() for name in lines[0][:MAX_COLUMNS]] if lines else []
     if missing := [name for name in _COLUMNS if name not in names]:
         raise SequenceError(
             f"{path} has no column {missing[0]}; expected a first line of {', '.join(_COLUMNS)}: "
@@ -81,6 +89,8 @@ def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
         ]
         table = np.array([row + [np.nan] * (len(names) - len(row)) for row in rows])
         table = table.reshape(-1, len(names))
+        if not len(table):
+            raise ValueError("it has no rows")
         if not np.isfinite(table[:, names.index("frame")]).all():
             raise ValueError("a row has no frame")
     except ValueError as error:

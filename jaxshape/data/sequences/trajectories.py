@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxshape import limits, reading
 from jaxshape.data.sequences.frames import SequenceError
 from jaxshape.data.sequences.poses import check_rigid, is_rigid
-from jaxshape.data.sequences.text import number, read_text, words_of
+from jaxshape.data.sequences.text import number, words_of
 from jaxshape.files import write_text
 
 
@@ -62,7 +63,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
     trajectory = read_unchecked(Path(path))
     T = trajectory.T_world_camera
     finite = np.isfinite(T).all(axis=(1, 2))
-    for bad in np.flatnonzero(finite & ~is_rigid(T)):
+    is_near = (np.abs(T[:, :3, 3]) <= limits.FAR).all(axis=-1)
+    for bad in np.flatnonzero(finite & ~(is_rigid(T) & is_near)):
         check_rigid(T[bad], f"Pose {bad} of {path}")
     times = None if trajectory.times is None else trajectory.times[finite]
     return Trajectory(T[finite], trajectory.frames[finite], times)
@@ -72,8 +74,8 @@ def read_unchecked(path: Path) -> Trajectory:
     """Read a trajectory as `read_trajectory` does, with poses that are lost or not rigid."""
     read = {".log": _read_log, ".json": _read_json}.get(path.suffix.lower(), _read_tum)
     try:
-        return read(read_text(path))
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        return read(reading.read_text(path))
+    except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
         raise SequenceError(
             f"{path} cannot be read as a trajectory ({type(error).__name__}: {error}); expected "
             "TUM's `time tx ty tz qx qy qz qw`, or Open3D's .log or .json: write it again."
@@ -120,7 +122,9 @@ def _read_tum(text: str) -> Trajectory:
             raise ValueError(f"line {line} holds {len(words)} numbers, not 8{hint}")
     numbers = np.array([[number(w) for w in words] for _, words in lines], dtype=np.float64)
     numbers = numbers.reshape(-1, 8)
-    quaternions, norms = numbers[:, 4:], np.linalg.norm(numbers[:, 4:], axis=1)
+    quaternions = numbers[:, 4:]
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(quaternions, axis=1)
     known = np.isfinite(numbers).all(axis=1)
     if (known & (np.abs(norms - 1) > 1e-2)).any():
         bad = int(np.flatnonzero(known & (np.abs(norms - 1) > 1e-2))[0])
@@ -173,12 +177,12 @@ def _log_text(trajectory: Trajectory) -> str:
 
 
 def _read_json(text: str) -> Trajectory:
-    parameters = json.loads(text)["parameters"]
-    by_columns = np.array([one["extrinsic"] for one in parameters], dtype=np.float64)
-    T_camera_world = np.swapaxes(by_columns.reshape(-1, 4, 4), 1, 2)
+    parameters = reading.parse_json(text)["parameters"]
+    by_columns = reading.numbers_of([one["extrinsic"] for one in parameters], (-1, 4, 4))
+    T_camera_world = np.swapaxes(by_columns, 1, 2)
     finite = np.isfinite(T_camera_world).all(axis=(1, 2))
     T = np.full_like(T_camera_world, np.nan)
-    T[finite] = np.linalg.inv(T_camera_world[finite])
+    T[finite] = np.linalg.inv(T_camera_world[finite])  # a singular one raises a ValueError
     return Trajectory(T, np.arange(len(T)))
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxshape import reading
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
+from jaxshape.data.sequences.documents import below
 from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import (
     Contents,
@@ -17,7 +19,6 @@ from jaxshape.data.sequences.listing import (
     with_colors_by_time,
 )
 from jaxshape.data.sequences.poses import READABLE_GAP, known, poses_at
-from jaxshape.data.sequences.text import read_text
 from jaxshape.data.sequences.trajectories import read_trajectory
 
 _CALIBRATED = {
@@ -65,8 +66,10 @@ def list_frames(contents: Contents) -> Listed:
 def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
     """Times, rising, and images of lines `time file`; a few lines may stand in another order."""
     try:
-        words = [line.split(maxsplit=1) for line in read_text(path).splitlines()]
+        words = [line.split(maxsplit=1) for line in reading.read_text(path).splitlines()]
         pairs = [(float(w[0]), w[1].strip()) for w in words if w and not w[0].startswith("#")]
+        if not np.isfinite([time for time, _ in pairs]).all():
+            raise ValueError("a time is not finite")
     except (OSError, ValueError, IndexError) as error:
         raise SequenceError(
             f"{path} is not a list of images ({error}); expected lines of `time file`: write it "
@@ -74,7 +77,9 @@ def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
         ) from error
     check_rising(np.array([time for time, _ in pairs]), path)
     pairs = sorted(pairs)
-    return np.array([time for time, _ in pairs]), [path.parent / file for _, file in pairs]
+    return np.array([time for time, _ in pairs]), [
+        below(path.parent, file, path) for _, file in pairs
+    ]
 
 
 def check_rising(times: Float[np.ndarray, " n"], path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Files of a recording that look like poses or a camera and are not read."""
+"""Entries of a recording that are not read: no files, or files that look like poses or a camera."""
 
 import re
 from collections.abc import Iterator
@@ -29,6 +29,12 @@ def unread(
         has_camera: Whether a camera was found.
         told: Remarks that were made already; files that they name are left out.
     """
+    if contents.others:
+        yield Finding(
+            f"not read, as they are no files: {', '.join(sorted(contents.others)[:4])}",
+            "Links to nothing, pipes and devices are passed over; copy the files again, if they "
+            "are of the recording.",
+        )
     told_of = " ".join(evidence for evidence, _ in told)
     untold = frozenset(name for name in contents.files if name not in told_of)
     contents = contents._replace(files=untold)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxshape.data.sequences.cameras import Calibration
-from jaxshape.data.sequences.documents import matrix_of, read_json_object, rows_of
+from jaxshape.data.sequences.documents import matrix_of, read_json_object, rows_of, shape_of
 from jaxshape.data.sequences.frames import SequenceError
 from jaxshape.data.sequences.listing import (
     Contents,
@@ -29,7 +29,7 @@ def list_frames(contents: Contents) -> Listed:
     """
     depth = depth_images(contents)
     source = contents.folder / _POSES
-    poses = {int(row[0]): np.reshape(row[1:], (4, 4)) for row in rows_of(source, (17,))}
+    poses = {row[0]: np.reshape(row[1:], (4, 4)) for row in rows_of(source, (17,))}
     if not poses:
         raise SequenceError(
             f"{source} holds no pose; expected a line for each image: copy it again."
@@ -57,5 +57,4 @@ def _calibration(contents: Contents) -> Calibration | None:
     if not np.array_equal(K[2], (0, 0, 1)):  # it is stored by columns
         K = K.T.copy()
     K[:2, 2] += 0.5  # theirs count from the centre of the first pixel
-    h, w = matrix_of([about.get("h"), about.get("w")], (2,), source, "w and h")
-    return Calibration(K[None], (int(h), int(w)), source.name)
+    return Calibration(K[None], shape_of(about.get("h"), about.get("w"), source), source.name)

@@ -21,7 +21,7 @@ from jaxshape.mapping.placement.faces import (
 )  # fmt: skip
 from jaxshape.mapping.segmentation.belonging import Seen, belonging
 from jaxshape.mapping.segmentation.parts import Parts, parts_of
-from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame
+from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame, resized
 
 RECENT = 8
 """Keyframes, besides the first, that a new one is compared with."""
@@ -33,17 +33,17 @@ FURTHER = 0.03
 """Metres outside of the box from which points count: noise goes that far."""
 
 
-def parts_in(prepared: PreparedFrame, *, first: bool = False) -> Parts:
+def parts_in(prepared: PreparedFrame, core: Bool[np.ndarray, "H W"] | None = None) -> Parts:
     """The parts of a frame at working size.
 
     Args:
         prepared: The frame.
-        first: Whether it is the first frame, whose mask shows the object.
+        core: Pixels that surely show the object, in full size `[H W]`; None for none.
     """
     fx, fy, cx, cy = (float(x) for x in prepared.view.intrinsics)
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    sure = np.asarray(prepared.masked) if first else None
-    return parts_of(np.asarray(prepared.view.depth), K, sure)
+    depth = np.asarray(prepared.view.depth)
+    return parts_of(depth, K, None if core is None else np.asarray(resized(core, depth.shape)))
 
 
 def cut_new(
@@ -106,4 +106,4 @@ def _seen(view: Cutout, parts: Parts | None) -> Seen:
     segmented = np.asarray(view.segmented)
     if parts is None:
         return Seen(world_points(view), np.zeros(segmented.shape, int), segmented)
-    return Seen(world_points(view), np.asarray(parts.labels), np.asarray(parts.sure))
+    return Seen(world_points(view), parts.labels, parts.sure, parts.corners)

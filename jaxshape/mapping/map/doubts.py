@@ -21,7 +21,8 @@ _LOWEST = 0.5  # percent of the points that may lie below what counts as measure
 
 
 def doubts_of(progress: Progress) -> tuple[str, ...]:
-    """Warnings of what was not seen of the object: in keyframes, of its box and of its legs.
+    """Warnings of frames that cannot be read, and of what was not seen of the object: in keyframes,
+    of its box and of its legs.
 
     Args:
         progress: Progress of a recording.
@@ -29,10 +30,23 @@ def doubts_of(progress: Progress) -> tuple[str, ...]:
     Returns:
         A sentence for each; none about a box that was given.
     """
+    told = (*_unreadable(progress), *_empty(progress))
     if progress.start.T_level_world is None:
-        return _empty(progress)
+        return told
     views = cutouts(progress.state.keyframes)
-    return (*_empty(progress), *_unseen(progress.start, views), *_legs(progress.start.box, views))
+    return (*told, *_unseen(progress.start, views), *_legs(progress.start.box, views))
+
+
+def _unreadable(progress: Progress) -> tuple[str, ...]:
+    logs = [log for log in progress.logs if log.status == "unreadable"]
+    if not logs:
+        return ()
+    which = _named([log.name for log in logs])
+    return (f"Frames that cannot be read are left out: {which}. {logs[0].reason}",)
+
+
+def _named(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def _empty(progress: Progress) -> tuple[str, ...]:
@@ -43,8 +57,7 @@ def _empty(progress: Progress) -> tuple[str, ...]:
     ]
     if not names:
         return ()
-    which = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-    return (f"No pixel was taken for the object in {which}; nothing of that is fused.",)
+    return (f"No pixel was taken for the object in {_named(names)}; nothing of that is fused.",)
 
 
 def _unseen(start: Start, views: list[Cutout]) -> tuple[str, ...]:

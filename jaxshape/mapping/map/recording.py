@@ -14,7 +14,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.mapping.map.cutting import cut_all, cut_new, is_outgrown, parts_in
@@ -28,8 +28,9 @@ from jaxshape.search.reconstruction import Reconstruction
 PLACE_AGAIN = (2, 3, 5, 8, 13)
 """Numbers of keyframes after which the object is placed anew."""
 
-REVISIONS = 2
-"""Times that the object is placed anew after one keyframe, where other pixels become the object."""
+REVISIONS, CHANGED = 2, 0.02
+"""Times that the object is placed anew after one keyframe, and the share of its pixels that have to
+become others or be no more the object for another time."""
 
 
 class FrameLog(NamedTuple):
@@ -121,7 +122,7 @@ def _begin(sequence: Sequence, start: Start, mapper: Mapper, use_poses: bool) ->
     frame = sequence[start.index]
     prepared = prepare(frame, start.masked)
     if start.T_level_world is not None and frame.mask is None:
-        prepared = prepared._replace(parts=parts_in(prepared, first=True))
+        prepared = prepared._replace(parts=parts_in(prepared, start.core))
     state, step = mapper.init(
         prepared,
         start.box,
@@ -191,10 +192,17 @@ def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progr
         keyframes = cut_all(keyframes, with_room(start))
         start = placed_again(start, prior, keyframes)
         pixels = [one.segmented for one in cut_all(keyframes, with_room(start))]
-        if all(bool((a == b.segmented).all()) for a, b in zip(pixels, keyframes, strict=True)):
+        if _changed(pixels, keyframes) < CHANGED:
             break
     state, shape = mapper.moved(state, start.box, room=room(start), segmented=pixels)
     return progress._replace(state=state, start=start, shape=shape)
+
+
+def _changed(pixels: list[Bool[Array, "h w"]], keyframes: tuple[Keyframe, ...]) -> float:
+    """Share of the object's pixels in keyframes that others have taken the place of."""
+    before = [np.asarray(one.segmented) for one in keyframes]
+    changed = sum(int((a != np.asarray(b)).sum()) for a, b in zip(before, pixels, strict=True))
+    return changed / max(1, sum(int(one.sum()) for one in before))
 
 
 def trajectory(progress: Progress) -> dict[int, Float[np.ndarray, "4 4"]]:

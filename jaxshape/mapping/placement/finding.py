@@ -62,6 +62,7 @@ class Start(NamedTuple):
     Attributes:
         index: Number of the frame in the recording, from 0.
         masked: Pixels of that frame that show the object `[h w]`; None where the box alone tells.
+        core: Those among them that surely do, whatever later frames show `[h w]`; None likewise.
         box: The object's box in the world.
         T_world_camera: Pose of the frame `[4 4]`.
         T_level_world: World to a frame with the same origin and +y up `[4 4]`; None where the box
@@ -75,6 +76,7 @@ class Start(NamedTuple):
 
     index: int
     masked: Bool[np.ndarray, "h w"] | None
+    core: Bool[np.ndarray, "h w"] | None
     box: Box
     T_world_camera: Float[np.ndarray, "4 4"]
     T_level_world: Float[np.ndarray, "4 4"] | None
@@ -133,7 +135,7 @@ def find_start(
     if box is not None:
         index, frame = first_readable(sequence, first, use_pose)
         T = _world_pose(frame, use_pose)
-        return Start(index, frame.mask, box, T, None, np.nan, None, (), ())
+        return Start(index, frame.mask, frame.mask, box, T, None, np.nan, None, (), ())
     reasons = []
     for index in range(first, min(first + FIRST_FRAMES, len(sequence))):
         try:
@@ -209,6 +211,7 @@ def _place_first(
     start = Start(
         index=index,
         masked=found.segmented,
+        core=found.core,
         box=Box(np.eye(4), np.ones(3)),
         T_world_camera=T_world_camera,
         T_level_world=T_level_world,

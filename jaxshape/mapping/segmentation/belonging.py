@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from jaxshape.data.boxes import Box, points_in_box
+from jaxshape.mapping.segmentation.parts import SPECK
+from jaxshape.mapping.segmentation.specks import confirmed
 
 NEAR = 0.03
 """Metres within which two frames have measured the same thing."""
@@ -38,13 +40,16 @@ class Seen(NamedTuple):
 
     Attributes:
         points: Points of the pixels, in metres; NaN where nothing was measured `[h w 3]`.
-        labels: Part of each pixel, from 1; 0 for floor, walls and table tops `[h w]`.
+        labels: Part of each pixel, from 1; 0 for floor, walls and table tops, `SPECK` for what is
+            too small to be a part `[h w]`.
         sure: True on pixels that are known to show the object `[h w]`.
+        corners: Labels of the parts that may be corners of something nearer `[n]`.
     """
 
     points: Float[np.ndarray, "h w 3"]
     labels: Int[np.ndarray, "h w"]
     sure: Bool[np.ndarray, "h w"]
+    corners: Int[np.ndarray, " n"] = np.zeros(0, int)
 
 
 class _Part(NamedTuple):
@@ -57,6 +62,7 @@ class _Part(NamedTuple):
         in_box: Share of it in the box of the object.
         in_reach: Share of it within the reach of the object.
         in_column: Share of it in the reach above and below the box.
+        is_corner: Whether it may be the corner of something nearer.
     """
 
     frame: int
@@ -65,6 +71,7 @@ class _Part(NamedTuple):
     in_box: float
     in_reach: float
     in_column: float
+    is_corner: bool
 
 
 class _Known(NamedTuple):
@@ -101,22 +108,32 @@ def belonging(
     for _ in range(ROUNDS):
         ours = [part for part in parts if _is_ours(part, known.ours)]
         taken = {part[:2] for part in ours}
-        apart = [part for part in parts if part[:2] not in taken and part.in_column < MOSTLY]
+        apart = [part for part in parts if part[:2] not in taken and _is_apart(part)]
         known = known._replace(others=_tree([*background, *(part.points for part in apart)]))
         before, whole = whole, {part[:2] for part in ours if _is_whole(part, known)}
         if whole == before:
             break
         more = [part.points for part in ours if part[:2] in whole]
         known = known._replace(ours=_tree([*sure, *more]))
-    return [
+    found = [
         _pixels(seen, [p for p in ours if p.frame == i], whole, known, box, reach)
         for i, seen in enumerate(frames)
     ]
+    return _with_specks(frames, found, known, reach)
 
 
 def _is_ours(part: _Part, ours: KDTree) -> bool:
-    """Whether a part is the object, all of it or some."""
-    return part.in_box > MOSTLY or float(_near(part.points, ours).mean()) > AGAIN
+    """Whether a part is the object, all of it or some.
+
+    What may be the corner of something nearer is so only if other frames show it as the object.
+    """
+    again = float(_near(part.points, ours).mean())
+    return again > MOSTLY if part.is_corner else part.in_box > MOSTLY or again > AGAIN
+
+
+def _is_apart(part: _Part) -> bool:
+    """Whether a part that is not the object is surely something else."""
+    return part.in_column < MOSTLY or part.in_reach < WHOLLY
 
 
 def _is_whole(part: _Part, known: _Known) -> bool:
@@ -145,6 +162,20 @@ def _pixels(
     return found
 
 
+def _with_specks(
+    frames: list[Seen], found: list[Bool[np.ndarray, "h w"]], known: _Known, reach: Box
+) -> list[Bool[np.ndarray, "h w"]]:
+    """The pixels with those of specks that other frames confirm."""
+    loose = [(seen.labels == SPECK) & points_in_box(seen.points, reach) for seen in frames]
+    for seen, pixels in zip(frames, loose, strict=True):
+        pixels[pixels] = ~_foreign(seen.points[pixels], known)
+    points = [seen.points[pixels] for seen, pixels in zip(frames, loose, strict=True)]
+    ours = [seen.points[pixels] for seen, pixels in zip(frames, found, strict=True)]
+    for pixels, both, more in zip(found, loose, confirmed(points, ours, reach), strict=True):
+        pixels[both] |= more
+    return found
+
+
 # Points ------------------------------------------------------------------------------------------
 
 
@@ -156,7 +187,8 @@ def _parts(index: int, seen: Seen, box: Box, reach: Box, column: Box) -> list[_P
         pixels = seen.labels == label
         points = seen.points[pixels]
         shares = [float(inside[pixels].mean()) for inside in within]
-        found.append(_Part(index, int(label), points[:: 1 + len(points) // _SAMPLE], *shares))
+        some, is_corner = points[:: 1 + len(points) // _SAMPLE], bool(label in seen.corners)
+        found.append(_Part(index, int(label), some, *shares, is_corner))
     return found
 
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_dilation
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree, QhullError
@@ -38,6 +39,11 @@ HIDDEN = 0.4
 
 GROWTH = 0.1
 """Largest distance of legs outside the footprint of the parts above them, in metres."""
+
+LARGER, BESIDE = 5, 4
+"""How many times larger than the corner of something nearer is what it hides, and the pixels within
+which it lies beside that and beside the border of the image: shadows of depth cameras are as wide,
+and so is the border where they measure nothing."""
 
 MOST = 9
 """Groups of clusters that are proposed as objects."""
@@ -210,17 +216,38 @@ def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
     """The main cluster, and those that belong to it: legs and slats which its own parts cut off.
 
     Clusters belong together if most of one stands on the footprint of the other, which is no larger
-    than furniture, or if one is much smaller and next to the other in space.
+    than furniture, or if one is much smaller and next to the other in space; but not if it is the
+    corner of something nearer that reaches into the image.
     """
     present = np.unique(labels[labels > 0]).tolist()
     clouds = {label: view.points[labels == label] for label in present}
-    chosen, others = [main], set(clouds) - {main}
+    chosen, others = [main], set(clouds) - {main, *corners(labels, view)}
     while True:
         body = np.concatenate([clouds[label] for label in chosen])
         new = [label for label in sorted(others) if _belongs(clouds[label], body, view.floor)]
         if not new:
             return chosen
         chosen, others = chosen + new, others - set(new)
+
+
+def corners(labels: Int[np.ndarray, "h w"], view: Scene) -> list[int]:
+    """Small clusters at the border of the image that hide some of a far larger one.
+
+    They may be the corners of something nearer, of which the image shows no more.
+    """
+    border = np.ones(labels.shape, bool)
+    border[BESIDE:-BESIDE, BESIDE:-BESIDE] = False
+    at_border = np.unique(labels[border])
+    sizes = np.bincount(np.maximum(labels, 0).ravel())
+    found = []
+    for label in at_border[at_border > 0].tolist():
+        piece = labels == label
+        beside = binary_dilation(piece, iterations=BESIDE) & (labels > 0)
+        beside[beside] = sizes[labels[beside]] > LARGER * sizes[label]
+        if beside.any():
+            z, behind = np.median(view.z[piece]), np.median(view.z[beside], keepdims=True)
+            found += [label] * bool(behind - z > tolerance(behind))
+    return found
 
 
 def groups(labels: Int[np.ndarray, "h w"], view: Scene) -> list[list[int]]:

@@ -9,7 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxshape.mapping.segmentation.clusters import background, clusters, look
+from jaxshape.mapping.segmentation.clusters import background, clusters, corners, look
+
+SPECK = -1
+"""Label of pixels that are part of no cluster and of no plane."""
 
 NO_FLOOR = np.full(4, np.nan)
 """The floor of a frame that shows none."""
@@ -20,8 +23,10 @@ class Parts(NamedTuple):
 
     Attributes:
         labels: Cluster of each pixel, from 1; 0 on floor, walls and table tops, and where nothing
-            was measured `[h w]`.
+            was measured; `SPECK` on what is none of these and too small for a cluster `[h w]`.
         sure: True on pixels that are known to show the object `[h w]`.
+        corners: Labels of the clusters that may be corners of something nearer, of which the image
+            shows no more `[n]`.
         floor: Normal of the floor, towards the camera, and the height of the camera above it in
             metres, in the frame of the camera `[4]`; NaN where no floor is seen.
         evidence: Evidence from this frame, from 0 to 1, that this is the floor.
@@ -29,6 +34,7 @@ class Parts(NamedTuple):
 
     labels: Int[np.ndarray, "h w"]
     sure: Bool[np.ndarray, "h w"]
+    corners: Int[np.ndarray, " n"]
     floor: Float[np.ndarray, " 4"]
     evidence: float
 
@@ -49,10 +55,13 @@ def parts_of(
         The clusters, and the floor with its evidence.
     """
     view = look(depth, K, stride=1)
-    labels = clusters(view, np.isfinite(view.z) & ~background(view, None))
+    free = np.isfinite(view.z) & ~background(view, None)
+    labels = clusters(view, free)
+    at_border = np.array(corners(labels, view), int)
+    labels[free & (labels == 0)] = SPECK
     known = np.zeros(depth.shape, bool) if sure is None else sure
     if view.floor is None:
-        return Parts(labels, known, NO_FLOOR, 0.0)
+        return Parts(labels, known, at_border, NO_FLOOR, 0.0)
     plane = view.floor.plane
     floor = np.array([*plane.normal, plane.offset], np.float64)
-    return Parts(labels, known, floor, view.floor.confidence)
+    return Parts(labels, known, at_border, floor, view.floor.confidence)

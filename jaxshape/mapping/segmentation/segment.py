@@ -41,11 +41,14 @@ class Segmentation(NamedTuple):
 
     Attributes:
         segmented: True on pixels that show the object `[h w]`.
+        core: True on those among them that were chosen, without the clusters that were joined to
+            them `[h w]`: other frames may show that these are something else.
         confidence: Confidence in the segmentation, from 0 to 1.
         reason: One sentence: what was found, and what makes it unsure.
     """
 
     segmented: Bool[np.ndarray, "h w"]
+    core: Bool[np.ndarray, "h w"]
     confidence: float
     reason: str
 
@@ -135,7 +138,9 @@ def segment(
         segmented |= feet_on(segmented, reduced(color, view.stride), view, view.floor.plane)
     is_told = clicked or prompt.number is not None
     doubts = [doubt, *doubts_of(segmented, behind, view, clicked=is_told)]
-    return Segmentation(enlarged(segmented, view, depth) & allowed, *judged(doubts, len(chosen)))
+    core = segmented & ~np.isin(labels, chosen[1:])
+    at_full_size = [enlarged(pixels, view, depth) & allowed for pixels in (segmented, core)]
+    return Segmentation(*at_full_size, *judged(doubts, len(chosen)))
 
 
 def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:
@@ -158,13 +163,15 @@ def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:
 
 
 def _nothing(measured: Bool[np.ndarray, "h w"], reason: str) -> Segmentation:
-    return Segmentation(np.zeros_like(measured), 0.0, f"{reason}, so nothing is segmented.")
+    nothing = np.zeros_like(measured)
+    return Segmentation(nothing, nothing, 0.0, f"{reason}, so nothing is segmented.")
 
 
 def _given(segmented: Bool[np.ndarray, "h w"]) -> Segmentation:
     if not segmented.any():
         return _nothing(segmented, "The given mask holds no pixel with a depth")
-    return Segmentation(segmented, 1.0, f"The given mask: {segmented.sum()} pixels with a depth.")
+    reason = f"The given mask: {segmented.sum()} pixels with a depth."
+    return Segmentation(segmented, segmented, 1.0, reason)
 
 
 # Which cluster ---------------------------------------------------------------------------------

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from analytic_room import CHAIR, CRATE, FLOOR, HEIGHT, TABLE, WALLS, WIDTH, K, iou, room
 
+from jaxshape.mapping.segmentation import clusters
 from jaxshape.mapping.segmentation.segment import Prompt, segment
 
 GROUPS = [FLOOR, WALLS, CHAIR, CRATE, TABLE]
@@ -167,3 +168,27 @@ def test_what_is_hidden_or_cut_is_less_sure(seen):
 def test_prompts_that_cannot_be_met_are_named(seen, prompt, said):
     with pytest.raises(ValueError, match=said):
         segment(seen.depth, None, K, prompt)
+
+
+def test_the_corner_of_something_nearer_is_not_joined_at_the_border_of_the_image(monkeypatch):
+    """A shelf before the seat, of which the image shows an end."""
+    shelf = [((0.1, 0.56, 0.05), (0.9, 0.6, 0.3))]
+    seen = room([FLOOR, WALLS, CHAIR, shelf], (0.3, 1.5, 1.6), (0.1, 0.4, 0))
+    depth, label = seen.depth[:, :90], seen.label[:, :90]
+    prompt = Prompt(click=middle_of(label == 2))
+    found = segment(depth, None, K, prompt).segmented
+    assert (label == 3).sum() > 50 and not found[label == 3].any()
+    assert found[label == 2].mean() > 0.9
+    monkeypatch.setattr(clusters, "corners", lambda labels, view: [])
+    assert segment(depth, None, K, prompt).segmented[label == 3].any()
+
+
+def test_the_core_is_what_was_clicked_without_what_was_joined_to_it():
+    board = [((-0.3, 0.3, 0.5), (0.3, 0.44, 0.52))]  # hides where the legs begin
+    seen = room([FLOOR, WALLS, CHAIR, board], (0.0, 0.9, 2.0))
+    found = segment(seen.depth, None, K, Prompt(click=middle_of(seen.label == 2)))
+    assert (found.core <= found.segmented).all()
+    low = _height(seen) < 0.25
+    assert found.segmented[(seen.label == 2) & low].mean() > 0.5
+    assert not found.core[(seen.label == 2) & low].any()
+    assert found.core[(seen.label == 2) & ~low].mean() > 0.5

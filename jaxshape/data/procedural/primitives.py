@@ -1,4 +1,4 @@
-"""Closed surfaces from plain arrays: everything a chair is made of is a loft, a tube or a slab.
+"""Closed surfaces from plain arrays: all procedural objects are made of lofts, tubes and slabs.
 
 Construction frame: metres, +y up, +z front, the floor at y = 0. A `Part` may be inside out;
 `assemble` turns every piece outward once, so the primitives need no rule about winding.
@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from jaxshape.data.chairs.draw import Number
+from jaxshape.data.procedural.draw import Number
 
 Numbers = np.ndarray | Sequence  # whatever numpy reads as coordinates
 

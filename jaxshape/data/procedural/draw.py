@@ -8,7 +8,7 @@ Weights = dict[str, float]
 
 
 class Draw:
-    """One chair's random choices.
+    """The random choices of one object.
 
     `record` keeps the named ones for the mesh's metadata; `stoutness` makes all the frame's
     members thicker than usual, or thinner.
@@ -23,7 +23,7 @@ class Draw:
         return low + (high - low) * self._rng.random()
 
     def thick(self, low: Number, high: Number) -> float:
-        """A thickness, in metres: `between`, times this chair's stoutness."""
+        """A thickness, in metres: `between`, times this object's stoutness."""
         return self.stoutness * self.between(low, high)
 
     def chance(self, probability: Number) -> bool:

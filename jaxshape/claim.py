@@ -1,0 +1,142 @@
+"""One writer for each output, which is found to be writable before the work. [host]"""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxshape.files import TEMPORARY, OutputError, unwritable
+from jaxshape.limits import FREE_BYTES, MIB
+
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None
+
+
+class Output(NamedTuple):
+    """What a command is going to write.
+
+    Attributes:
+        path: Its folder or file.
+        is_file: Whether it is one file.
+        goes_on: Whether the same command, given again, goes on where it was stopped.
+        needs: Free bytes without which it is not begun.
+    """
+
+    path: Path
+    is_file: bool = False
+    goes_on: bool = False
+    needs: int = FREE_BYTES
+
+    @property
+    def folder(self) -> Path:
+        """The folder that is written to."""
+        return self.path.parent if self.is_file else self.path
+
+    @property
+    def kept(self) -> str:
+        """What is left of a command that was stopped, as a sentence."""
+        if self.goes_on:
+            return "What was finished is kept; the same command goes on from there."
+        return "Give the same command again to make it anew."
+
+
+@contextmanager
+def claimed(output: Output) -> Iterator[None]:
+    """Keep an output to oneself for the block that writes it.
+
+    The folder is made if it is missing, and removed again if nothing came into it. What a killed
+    writer left half done is removed.
+
+    Args:
+        output: What is going to be written.
+
+    Raises:
+        OutputError: It cannot be written, is too small, or another process is writing it.
+    """
+    _check_kind(output)
+    made = [one for one in (output.folder, *output.folder.parents) if not one.exists()]
+    try:
+        try:
+            output.folder.mkdir(parents=True, exist_ok=True)
+            _check_space(output)
+            lock = _locked(output)
+        except OSError as problem:
+            raise unwritable(output.folder, problem) or problem from problem
+        try:
+            _remove_halves(output)
+            yield
+        finally:
+            _release(output, lock)
+    finally:
+        for folder in made:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
+
+
+def _check_kind(output: Output) -> None:
+    if output.is_file and output.path.is_dir():
+        raise OutputError(f"{str(output.path)!r} is a folder; give the name of a file in it.")
+    if not output.is_file and output.path.exists() and not output.path.is_dir():
+        raise OutputError(f"{str(output.path)!r} is a file; give a folder as --output.")
+
+
+def _check_space(output: Output) -> None:
+    free = shutil.disk_usage(output.folder).free
+    if free < output.needs:
+        raise OutputError(
+            f"{str(output.folder)!r} has room for {free / MIB:.0f} MB, and "
+            f"{output.needs / MIB:.0f} MB are needed; make room, or give another --output."
+        )
+
+
+def _remove_halves(output: Output) -> None:
+    patterns = (f"{TEMPORARY}{output.path.stem[:100]}-*",) if output.is_file else (
+        f"{TEMPORARY}*",
+        f"*/{TEMPORARY}*",
+    )  # fmt: skip
+    for pattern in patterns:
+        for half in output.folder.glob(pattern):
+            half.unlink(missing_ok=True)
+
+
+# Locks -----------------------------------------------------------------------------------------
+
+
+def _lock_file(output: Output) -> Path:
+    return output.folder / (f".{output.path.name}.lock" if output.is_file else ".lock")
+
+
+def _locked(output: Output) -> int:
+    """The open file that others find locked while this process lives; it names the process."""
+    path = _lock_file(output)
+    while True:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(lock), os.stat(path)):  # not just removed by another
+                os.truncate(lock, 0)
+                os.write(lock, f"{os.getpid()}\n".encode())
+                return lock
+        except BlockingIOError:
+            who = os.read(lock, 20).decode(errors="replace").strip()
+            os.close(lock)
+            raise OutputError(
+                f"{str(output.path)!r} is being written by another command (process {who}); wait "
+                "for it, or give another --output."
+            ) from None
+        except FileNotFoundError:
+            pass
+        except OSError:  # a disk without locks
+            return lock
+        os.close(lock)
+
+
+def _release(output: Output, lock: int) -> None:
+    with suppress(OSError):
+        _lock_file(output).unlink()
+    os.close(lock)

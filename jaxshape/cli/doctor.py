@@ -1,0 +1,110 @@
+"""`jaxshape doctor`: what this machine gives jaxshape, and what makes it slow here."""
+
+import json
+import os
+import platform
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+PACKAGES = (
+    "jaxshape", "jax", "jaxlib", "flax", "optax", "evosax", "numpy", "scipy", "trimesh", "embreex",
+    "scikit-image", "pillow", "viser", "OpenEXR",
+)  # fmt: skip
+"""Packages whose version decides what works; the last two and embreex are optional."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Say which versions, devices, caches and weights jaxshape finds, and what is slow and why.
+
+    Examples: jaxshape doctor
+
+    jaxshape doctor --json, for a bug report
+    """
+
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def run(self) -> None:
+        found = findings()
+        if self.json:
+            print(json.dumps(found, indent=1))
+            return
+        table = Table(show_header=False, box=None)
+        for name, value in found.items():
+            if name != "advice":
+                table.add_row(name, escape(_text(value)))
+        out = Console()
+        out.print(table)
+        for sentence in found["advice"]:
+            out.print(f"[yellow]slow[/] {escape(sentence)}", soft_wrap=True)
+
+
+def findings() -> dict[str, Any]:
+    """Everything that `jaxshape doctor` prints, as JSON can hold it."""
+    import jax
+
+    from jaxshape.model.weights import PACKAGED, load_prior
+    from jaxshape.process import processor
+
+    devices = jax.devices()
+    return {
+        "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
+        "packages": {name: _version(name) for name in PACKAGES},
+        "devices": [f"{one.platform}: {one.device_kind}" for one in devices],
+        "processor": processor().name,
+        "cores": os.cpu_count(),
+        "matrix units": sorted(f for f in processor().features if f.startswith("amx")),
+        "compiled programs": _cache(os.environ.get("JAX_COMPILATION_CACHE_DIR")),
+        "weights": {name: load_prior(name).model.kind for name in PACKAGED},
+        "advice": list(advice(devices[0].platform)),
+    }
+
+
+def advice(device: str) -> Iterator[str]:
+    """What makes this machine slow, and what helps."""
+    from jaxshape.process import processor
+
+    features = processor().features
+    if device == "cpu":
+        if features and "amx_bf16" not in features:
+            yield "The processor has no matrix units for bfloat16: leave --bfloat16 out."
+        if (os.cpu_count() or 1) < 4:
+            yield "Training has few cores to spread over; a GPU is used where JAX finds one."
+        for tool in ("nvidia-smi", "rocm-smi"):
+            if any((Path(p) / tool).exists() for p in os.environ.get("PATH", "").split(os.pathsep)):
+                yield "There is a GPU, and JAX does not see it: pip install 'jaxshape[cuda]'."
+                break
+    if find_spec("embreex") is None:
+        yield "Without embreex, virtual cameras trace rays by trimesh alone, which is far slower."
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        yield "No folder for compiled programs can be written: every run compiles anew."
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _cache(folder: str | None) -> str | None:
+    """The folder of compiled programs and its size."""
+    if folder is None or not Path(folder).is_dir():
+        return None
+    sizes = [entry.stat().st_size for entry in Path(folder).iterdir() if entry.is_file()]
+    return f"{folder}, {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {one}" for name, one in value.items() if one)
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

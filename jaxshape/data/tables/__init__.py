@@ -1,0 +1,14 @@
+"""Procedural tables: dining, coffee and side tables, desks, trestles, pedestals and many more.
+
+A table is drawn in the order of its modules: `tops`, `bases` (what carries a top), `storage`
+(drawers, shelves, what stands on a desk), `family` (styles, frequencies, sizes).
+
+The canonical frame is that of the chairs: +y up, box centred at the origin. The long side of a top
+lies along x. A table that has a front, as a desk with its drawers and the place of its sitter,
+turns it to +z; most others look the same from both long sides, square and round ones from all four.
+"""
+
+from jaxshape.data.tables.family import FREQUENCIES as FREQUENCIES
+from jaxshape.data.tables.family import STYLES as STYLES
+from jaxshape.data.tables.family import TABLES as TABLES
+from jaxshape.data.tables.family import random_table as random_table
