@@ -119,7 +119,10 @@ def check_axes(
         return
     given, count = (axes.up, axes.front), len(sources)
     if 2 * len(lying) > count:
-        standing = usual_axes(_scores(evenly(sources, VOTERS), axes, prior), ("z", "-y"))
+        scores = _scores(evenly(sources, VOTERS), axes, prior)
+        if not scores and not refuse:  # these are no seats
+            return
+        standing = usual_axes(scores, ("z", "-y"))
         complaint = (
             f"{len(lying)} of {count} meshes seem to lie on their side, {lying[0]!r} for one{{}}; "
             f"name the axis that points up, for example {_flags(standing)}."
@@ -157,19 +160,19 @@ def _scores(
     """How well each pair of axes of the files fits each mesh; empty where nothing is known of their
     kind: `prior` knows its own, the weights for chairs know seats."""
     from jaxshape.data.meshes import Skipped, load, resembles_a_seat
-    from jaxshape.model.facing import facing_scores
+    from jaxshape.model.facing import are_known, facing_scores
     from jaxshape.model.weights import load_prior
 
     loaded = [load(source, unit=axes.unit) for source in sources]
     models = [model for model in loaded if not isinstance(model, Skipped)]
-    if prior is None:
-        models = [model for model in models if resembles_a_seat(model.mesh)]
-        if 2 * len(models) <= len(sources):
-            return {}
-        prior = load_prior(None)
+    may_be_seats = [model for model in models if resembles_a_seat(model.mesh)]
+    if prior is None and 2 * len(may_be_seats) <= len(models):
+        return {}
+    known = load_prior(None) if prior is None else prior
     with progress_bar("meshes") as bar:
         task = bar.add_task("axes", note="")
-        return {
-            model.name: facing_scores(prior, model.mesh, ups)
+        scores = {
+            model.name: facing_scores(known, model.mesh, ups)
             for model in bar.track(models, task_id=task)
         }
+    return scores if prior is not None or are_known(scores) else {}

@@ -32,7 +32,7 @@ class Died(NamedTuple):
         return f"Its process ended with {how}, twice; memory may have run out."
 
 
-class WorkersDied(RuntimeError):
+class WorkersDied(ChildProcessError):
     """A process ended before it could begin to work."""
 
 
@@ -138,7 +138,8 @@ def _exit_code(worker: _Worker) -> int:
     if not worker.is_ready:
         raise WorkersDied(
             f"A worker process ended with exit status {code} before it began; the same command "
-            "goes on, with fewer --workers where memory is short."
+            "goes on, with fewer --workers where memory is short. (A script has to start processes "
+            "under `if __name__ == '__main__':`.)"
         )
     return code
 

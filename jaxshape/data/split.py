@@ -67,8 +67,8 @@ def same_shapes(meshes: Sequence[Surveyed]) -> list[int]:
     """
     if not meshes:
         return []
-    pairs = KDTree([mesh.signature for mesh in meshes]).query_pairs(SAME, p=np.inf)
-    a, b = np.array(sorted(pairs), int).reshape(-1, 2).T
+    tree = KDTree([mesh.signature for mesh in meshes])
+    a, b = tree.query_pairs(SAME, p=np.inf, output_type="ndarray").T
     near = coo_matrix((np.ones(len(a)), (a, b)), (len(meshes), len(meshes)))
     return connected_components(near, directed=False)[1].tolist()
 

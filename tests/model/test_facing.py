@@ -9,7 +9,7 @@ from jaxshape.data.capture import true_surface
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.meshes import axes_to_canonical, canonical
 from jaxshape.geometry import grid
-from jaxshape.model.facing import _turned, dissenting, facing_scores, usual_axes
+from jaxshape.model.facing import _turned, are_known, dissenting, facing_scores, usual_axes
 
 AXES = [("y", "z"), ("z", "-y"), ("-x", "z")]
 
@@ -53,4 +53,5 @@ def test_unclear_meshes_go_with_the_others():
     }  # fmt: skip
     assert usual_axes(scores, a) == b
     assert dissenting(scores, b) == {"other": a}
+    assert are_known(scores) and not are_known({"mug": {a: -0.4}}) and not are_known({})
     assert usual_axes({"stool": scores["stool"]}, b) == b and usual_axes({}, b) == b

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxshape.data.formats.parts import MAX_FACES, NotSupported, Unreadable
+from jaxshape.data.formats.parts import NotSupported, Unreadable
+from jaxshape.limits import MESH_BYTES
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -35,7 +36,7 @@ class GltfFile(NamedTuple):
         """Numbers `[count width]` of an accessor, as floats where they are normalized integers."""
         about = self.list("accessors")[index]
         kind, width, count = _TYPES[about["componentType"]], _WIDTHS[about["type"]], about["count"]
-        if not 0 <= count <= 3 * MAX_FACES:
+        if not 0 <= count * width * np.dtype(kind).itemsize <= MESH_BYTES:
             raise Unreadable(f"An accessor says that it has {count} entries.")
         if "bufferView" in about:
             values = self.view(about["bufferView"], kind, width, count, about.get("byteOffset", 0))

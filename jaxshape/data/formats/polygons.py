@@ -3,7 +3,10 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxshape.data.formats.parts import Unreadable, check_faces
+from jaxshape.data.formats.parts import NotSupported, Unreadable, check_faces
+
+MAX_CORNERS = 10_000
+"""Most corners of a polygon that is not convex: the time for its ears may grow with the square."""
 
 
 def triangulate(
@@ -22,6 +25,7 @@ def triangulate(
         Rows of `vertices`, `count - 2` triangles for each polygon; fewer where corners repeat.
 
     Raises:
+        NotSupported: A polygon that is not convex has more than `MAX_CORNERS` corners.
         Unreadable: A polygon refers to a vertex that is not there.
         TooManyFaces: There are too many triangles.
     """
@@ -37,6 +41,8 @@ def triangulate(
         fans = polygons[convex][:, _fan(count)]
         triangles.append(fans.reshape(-1, 3))
         owners.append(which[convex].repeat(count - 2))
+        if count > MAX_CORNERS and not convex.all():
+            raise NotSupported(f"A polygon with notches has {count} corners; split it.")
         for owner, polygon in zip(which[~convex], polygons[~convex], strict=True):
             cut = polygon[_ears(vertices[polygon])]
             triangles.append(cut)
