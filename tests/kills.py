@@ -133,11 +133,12 @@ def main() -> None:
         left, ends = kills, 0
         while left or not ends:  # what ended between two kills begins anew
             after = draw.uniform(0.1, 0.9) * lasted if left else None
+            began = time.monotonic()
             status = run(arguments, killed, after, at / "log.txt")
             if status == -signal.SIGKILL:
                 left -= 1
                 continue
-            ends += 1
+            ends, lasted = ends + 1, min(lasted, time.monotonic() - began)
             lost += [f"exit status {status}"] if status else differences(killed, whole)
             shutil.rmtree(killed, ignore_errors=True) if killed.is_dir() else killed.unlink()
         said = ", ".join(lost) or "the same result"

@@ -69,6 +69,21 @@ def test_a_full_disk_is_refused_before_the_work(started, tmp_path, monkeypatch):
     assert not os.listdir(tmp_path)
 
 
+def test_a_dataset_says_how_much_room_it_needs(run, tmp_path, monkeypatch):
+    """Of which what is there already is not needed again."""
+    free = shutil.disk_usage(tmp_path)._replace(free=10**9)
+    monkeypatch.setattr(claim.shutil, "disk_usage", lambda _: free)
+    monkeypatch.setattr(learning.BuildDataset, "run", never)
+    make = ("dataset", "--output", tmp_path / "data", "--frames", 1, 2, "--count", 20_000)
+    status, _, err = run(*make)
+    assert status == 2 and "room for 954 MB, and 1328 MB are needed" in err
+    (tmp_path / "data").mkdir()
+    with open(tmp_path / "data" / "shard-00000.measured.npy", "wb") as file:
+        file.truncate(5 * 10**8)
+    monkeypatch.setattr(learning.BuildDataset, "run", lambda _: None)
+    assert run(*make)[0] == 0
+
+
 def test_two_runs_into_one_output_do_not_meet(started, tmp_path):
     name, start = started
     with claimed(Output(tmp_path / "out", is_file=name in FILES)):

@@ -51,8 +51,10 @@ def look_at(sources: Sequence[Any], axes: Axes, workers: int | None = None) -> l
     return found
 
 
-def load_models(sources: Sequence[Any], axes: Axes) -> tuple[list[Any], list[Any]]:
-    """The meshes (`Model`) that can be used, and those that are `Skipped`."""
+def load_models(
+    sources: Sequence[Any], axes: Axes, *, refuse: bool = True
+) -> tuple[list[Any], list[Any]]:
+    """The meshes (`Model`) that can be used, and those `Skipped`; it may refuse to use none."""
     from jaxshape.data.dataset import load_object
     from jaxshape.data.meshes import Skipped
     from jaxshape.data.survey import doubted_size
@@ -68,7 +70,7 @@ def load_models(sources: Sequence[Any], axes: Axes) -> tuple[list[Any], list[Any
     report_skipped(skipped)
     report_notes((model.name, note) for model in models for note in model.notes)
     require(
-        bool(models),
+        bool(models) or not refuse,
         f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
         f"{skipped[0].reason}. {skipped[0].detail}"
         if skipped

@@ -84,7 +84,15 @@ class BuildDataset:
     @property
     def writes(self) -> Output:
         """What is written."""
-        return Output(self.folder, goes_on=True)
+        return Output(self.folder, goes_on=True, needs=max(limits.FREE_BYTES, self._missing()))
+
+    def _missing(self) -> int:
+        """Bytes of procedural objects that are not there yet; meshes are counted later."""
+        if self.meshes is not None:
+            return 0
+        voxels, paths = self.config.resolution**3, self.config.paths
+        whole = self.count * paths * (voxels // 8 + len(self.config.frames) * voxels)
+        return whole - sum(path.stat().st_size for path in self.folder.glob("shard-*.npy"))
 
     def run(self) -> None:
         from jaxshape.data.families import TEST_SEEDS, procedural_objects
