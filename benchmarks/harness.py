@@ -3,13 +3,11 @@
 import importlib
 import json
 import os
-import platform
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -18,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxshape.process import processor
+from jaxshape.bench.machine import describe_machine
 
 ROOT = Path(__file__).parents[1]
 BURST = 0.03
@@ -147,27 +145,4 @@ def in_fresh_process(function: str, *arguments: Any, **environment: str) -> Any:
 
 def machine() -> dict[str, Any]:
     """What a reader needs to compare figures: processor, device, versions."""
-    model, features = processor()
-    return {
-        "processor": model,
-        "cores": _cores(),
-        "features": [f for f in ("avx2", "avx512f", "avx512_bf16", "amx_bf16") if f in features],
-        "device": jax.devices()[0].device_kind if jax.default_backend() != "cpu" else "cpu",
-        "system": platform.system(),
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
-    }
-
-
-def _cores() -> int:
-    """Those this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
+    return describe_machine(PACKAGES)

@@ -150,7 +150,7 @@ def by_residual(residual: Residual, prior: ShapePrior, iterations: int) -> Conte
     search = replace(residual.search, tolerance=0.0)
     refiner = build_refiner("gradient:adam", len(prior.code_mean), search)
     steps = iterations // len(residual.prior_scales)
-    penalty = code_penalty(prior, search.prior_weight)
+    penalty = code_penalty(prior)
 
     def contest(keys, prior: ShapePrior, case: Case):
         grids = case.grids
@@ -163,7 +163,8 @@ def by_residual(residual: Residual, prior: ShapePrior, iterations: int) -> Conte
             targets = weigh(grids, anchor, weights)
             found = refine(
                 keys, prior, code, targets, refiner, steps,
-                space=search_space(prior, search), penalty=penalty,
+                space=search_space(prior, search),
+                penalty=penalty, penalty_weight=search.prior_weight,
             )  # fmt: skip
             code, logits = found.code, found.logits
             anchor = logits if residual.anchor_moves else anchor

@@ -12,15 +12,16 @@ Results: experiments/results/step_size.json, .png and .svg, and the searches alo
 step_size_curves.png and .svg; chairs that are done are kept. Time: 10 minutes on two cores.
 """
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import tyro
 from jaxtyping import Array
 
@@ -34,9 +35,8 @@ from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
 from jaxshape.search.config import RefineConfig
-from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES, gradient
+from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES
 from jaxshape.search.reconstruction import reconstruct, refiner_for
-from jaxshape.search.refiner import Refiner
 from study import (
     Claim,
     Contestant,
@@ -66,6 +66,12 @@ def grid(raw: set[float], whitened: set[float]) -> list[Trial]:
 
 
 DESCENT = "gradient descent"
+SETTINGS = {
+    DESCENT: ("gradient", "step_size"),
+    "Adam": ("gradient:adam", "step_size"),
+    "CMA-ES": ("cma", "sigma0"),
+}
+"""The name of each method, and the setting that is tried."""
 DEFAULTS = {
     DESCENT: Trial("whitened", STEP_SIZES["whitened"]),
     "Adam": Trial("whitened", LEARNING_RATE),
@@ -117,42 +123,24 @@ def run(config: Config) -> Journal:
     }
     journal = Journal(config.results / "step_size.json", settings)
     search = RefineConfig(iterations=config.iterations, tolerance=0.0)
-    population = refiner_for("cma", prior, replace(search, sigma0=1.0))
-    assert population is not None
-    # A population of sigma0 = s is one of sigma0 = 1 in a space that is s times as wide.
-    contestants = {
-        DESCENT: trying(DESCENT, lambda step: (gradient(optax.sgd(step)), 1.0), prior, search),
-        "Adam": trying("Adam", lambda step: (gradient(optax.adam(step)), 1.0), prior, search),
-        "CMA-ES": trying("CMA-ES", lambda step: (population, step), prior, search),
-    }
+    contestants = {method: trying(method, search) for method in TRIALS}
     compare(contestants, prior, config.test, config.frames, journal, at_a_time=CASES_AT_A_TIME)
     conclude(journal, claims(journal, config), summary=summary(journal, config))
     return journal
 
 
-def trying(
-    method: str,
-    search_with: Callable[[Array], tuple[Refiner, Array | float]],
-    prior: ShapePrior,
-    config: RefineConfig,
-) -> Contestant:
-    """The contestant that searches with every value of a method, one after another.
-
-    `search_with` a value gives the refiner and how wide its space is. The values are data, so that
-    one program does for all.
-    """
-    steps = jnp.array([trial.step for trial in TRIALS[method]])
-    is_raw = jnp.array([trial.space == "raw" for trial in TRIALS[method]])
+def trying(method: str, config: RefineConfig) -> Contestant:
+    """The contestant that searches with every value of a method, all values in one program."""
+    name, setting = SETTINGS[method]
     often = jnp.array(sampled(config.iterations)) - 1
 
     def contest(keys: Array, prior: ShapePrior, case: Case) -> Scores:
-        def attempt(value: tuple[Array, Array]) -> dict[str, Array]:
-            step, is_raw = value
-            refiner, width = search_with(step)
-            covariance = jnp.where(is_raw, jnp.eye(len(prior.code_mean)), prior.code_covariance)
-            space = prior._replace(code_covariance=width**2 * covariance)
-            F, M = case.grids.occupied, case.grids.occluded
-            found = reconstruct(keys, space, F, M, refiner, config)
+        F, M = case.grids.occupied, case.grids.occluded
+
+        def attempt(space: str, step: Array) -> dict[str, Array]:
+            settings: dict[str, Any] = {"space": space, setting: step}
+            search = replace(config, **settings)
+            found = reconstruct(keys, prior, F, M, refiner_for(name, prior, search), search)
             assert found.trace is not None
             drawn = jnp.nan_to_num(found.trace.loss, posinf=WORST)
             return {
@@ -166,10 +154,19 @@ def trying(
                 "drawn": drawn[:, often],
             }
 
-        scores = jax.lax.map(attempt, (steps, is_raw))
-        return {name: values.swapaxes(0, 1) for name, values in scores.items()}
+        scores = [
+            jax.vmap(partial(attempt, space), out_axes=1)(jnp.array(steps))
+            for space, steps in by_space(TRIALS[method]).items()
+        ]
+        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *scores)
 
     return contest
+
+
+def by_space(trials: Sequence[Trial]) -> dict[str, list[float]]:
+    """The values of a method in each space, in the order of the trials."""
+    groups = itertools.groupby(trials, key=lambda trial: trial.space)
+    return {space: [trial.step for trial in group] for space, group in groups}
 
 
 def sampled(iterations: int) -> list[int]:

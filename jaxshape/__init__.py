@@ -38,6 +38,7 @@ Data moves one way, and so do imports:
     mapping    segmentation, the object's frame, ICP, keyframes, realignment of a recording
     results    surfaces, metrics, evaluation, the files of a result
     report     pictures, plots, the report page, the live view, the model card
+    bench      a frozen set of problems, searches against each other on it, their board
     cli        the `jaxshape` command
 """
 

@@ -1,3 +1,6 @@
+from .bench.ask_tell import AskTell
+from .bench.own_loop import Watch, enter_benchmark
+from .bench.problems import Problem, problems
 from .data.archives import MeshSource
 from .data.boxes import Box
 from .data.capture import (
@@ -44,9 +47,11 @@ from .results.surface import surface, write_mesh
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
 from .search.composition import Composition, complete, compose
 from .search.config import RefineConfig
+from .search.export import export_reconstruct, load_reconstruct
 from .search.methods import build_refiner
 from .search.methods.cma import cma
 from .search.methods.evosax import evosax_strategy
+from .search.methods.gauss_newton import gauss_newton
 from .search.methods.gradient import gradient
 from .search.methods.hybrid import polished
 from .search.objective import objective
@@ -86,6 +91,7 @@ from .search.stopping import Tolerances
 
 __all__ = [
     "Architecture",
+    "AskTell",
     "BALANCED",
     "Bounds",
     "Box",
@@ -111,6 +117,7 @@ __all__ = [
     "PlacementConfig",
     "Prepared",
     "PreparedFrame",
+    "Problem",
     "Progress",
     "Prompt",
     "Reconstruction",
@@ -134,6 +141,7 @@ __all__ = [
     "TrackingConfig",
     "Trajectory",
     "VirtualCamera",
+    "Watch",
     "Weights",
     "binary",
     "bounds",
@@ -152,8 +160,10 @@ __all__ = [
     "decode",
     "decode_prepared",
     "encode",
+    "enter_benchmark",
     "equation_7",
     "evosax_strategy",
+    "export_reconstruct",
     "f_score",
     "find_start",
     "finite_or_inf",
@@ -163,11 +173,13 @@ __all__ = [
     "follow",
     "fuse_frames",
     "fuse_surface",
+    "gauss_newton",
     "gradient",
     "iou",
     "keep_better",
     "load",
     "load_prior",
+    "load_reconstruct",
     "measure",
     "measure_frames",
     "merge",
@@ -179,6 +191,7 @@ __all__ = [
     "orbit",
     "place",
     "polished",
+    "problems",
     "random_chair",
     "random_table",
     "random_views",

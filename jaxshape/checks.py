@@ -2,10 +2,12 @@
 
 A settings dataclass calls them in its `__post_init__`. Each raises a `BadSetting`, a `ValueError`
 that begins with the name of the field, as in "population is 2; give a whole number, 3 or more.";
-the command line puts the name of its option there.
+the command line puts the name of its option there. Numbers that JAX traces have no value yet and
+pass.
 """
 
 import math
+import sys
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any, NoReturn
@@ -88,7 +90,7 @@ def positive(name: str, value: Any, unit: str = "") -> None:
         value: The value to check.
         unit: Its unit in the plural, as "metres"; empty where it has none.
     """
-    if not (_is_number(value) and 0 < value < math.inf):
+    if not (is_traced(value) or _is_number(value) and 0 < value < math.inf):
         refuse(name, value, f"a number of {unit} above 0" if unit else "a number above 0")
 
 
@@ -100,7 +102,7 @@ def at_least(name: str, value: Any, least: int | float) -> None:
         value: The value to check.
         least: The smallest number it takes.
     """
-    if not (_is_number(value) and least <= value < math.inf):
+    if not (is_traced(value) or _is_number(value) and least <= value < math.inf):
         refuse(name, value, f"a number, {least:g} or more")
 
 
@@ -113,10 +115,22 @@ def within(name: str, value: Any, low: int | float, high: int | float) -> None:
         low: The smallest number it takes.
         high: The largest number it takes.
     """
-    if not (_is_number(value) and low <= value <= high):
+    if not (is_traced(value) or _is_number(value) and low <= value <= high):
         refuse(name, value, f"a number from {low:g} to {high:g}")
 
 
+def is_traced(value: Any) -> bool:
+    """Whether a value is known only when a program of JAX runs: under `jax.jit` or `jax.vmap`.
+
+    Args:
+        value: Any value. JAX is not imported to find out.
+    """
+    core = sys.modules.get("jax.core")
+    return core is not None and isinstance(value, core.Tracer)
+
+
 def _is_number(value: Any) -> bool:
-    """Whether a value is a real number; NaN is one, and fails every comparison."""
+    """Whether a value is a real number or an array of one; NaN is, and fails every comparison."""
+    if hasattr(value, "dtype") and getattr(value, "ndim", None) == 0:
+        value = value.item()
     return isinstance(value, Real) and not isinstance(value, bool)

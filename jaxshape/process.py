@@ -98,7 +98,10 @@ def spread_over_cores(batch: int) -> None:
 
 
 def join_processes(
-    coordinator: str | None = None, processes: int | None = None, process: int | None = None
+    coordinator: str | None = None,
+    processes: int | None = None,
+    process: int | None = None,
+    patience: int = 300,
 ) -> None:
     """Make this process one of several that compute together; to be called before JAX computes.
 
@@ -107,6 +110,7 @@ def join_processes(
             that JAX knows, such as Slurm or Open MPI.
         processes: Number of processes; None as for the coordinator.
         process: Number of this process, from 0; None as for the coordinator.
+        patience: Seconds, 1 or more, that a process which is done waits for the others to end.
 
     Raises:
         ValueError: Only some are given, or no cluster is found.
@@ -121,7 +125,9 @@ def join_processes(
     import jax
 
     try:
-        jax.distributed.initialize(coordinator, processes, process)
+        jax.distributed.initialize(
+            coordinator, processes, process, shutdown_timeout_seconds=patience
+        )
     except ValueError as problem:
         if not missing:
             raise

@@ -22,6 +22,7 @@ from jaxshape.data import dataset
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.chairs import random_chair
+from jaxshape.data.families import TEST_SEEDS
 from jaxshape.data.split import hold_out
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map import mapper
@@ -38,7 +39,7 @@ from jaxshape.search.names import families
 
 COMMANDS = (
     "demo", "dataset", "train", "reconstruct", "complete", "inspect", "evaluate", "plot", "view",
-    "doctor",
+    "doctor", "bench",
 )  # fmt: skip
 
 
@@ -453,15 +454,16 @@ def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear):
     assert 0 < results[0]["mesh_measured"] < 1 and 0 < results[0]["symmetry_agreement"] <= 1
 
 
-def test_demo_as_in_the_paper(run, tmp_path, linear):
+def test_demo_of_a_table_as_in_the_paper(run, tmp_path, linear):
     """Clean square images, points in voxels, nothing mirrored."""
     few = ("--frames", 2, "--method", "encoder")
     paper = ("--camera", "paper", "--no-symmetry", "--objective", "paper")
-    status, _, err = run("demo", *linear, *few, *paper, "--output", tmp_path)
+    status, _, err = run("demo", "--family", "table", *linear, *few, *paper, "--output", tmp_path)
     assert status == 0, err
     result = json.loads((tmp_path / "result.json").read_text())
     seen = {"camera": "paper", "noise": False, "fusion": "points"}
     assert result.items() >= seen.items() and result["search"]["objective"] == "paper"
+    assert result["object"] == f"procedural table {TEST_SEEDS}"
     assert not result.keys() & {"symmetric", "symmetry_agreement", "mesh_measured"}
     with np.load(tmp_path / "grid.npz") as grids:
         F, M, completed = (grids[name] for name in ("occupied", "occluded", "refined"))

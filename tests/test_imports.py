@@ -18,7 +18,7 @@ ALONE = ("limits",)
 
 BELOW_ALL = (*ALONE, "checks", "reading", "files", "process", "claim")
 
-PACKAGES = ("geometry", "data", "model", "search", "mapping", "results", "report", "cli")
+PACKAGES = ("geometry", "data", "model", "search", "mapping", "results", "report", "bench", "cli")
 ROOMS = ("config", "segmentation", "tracking", "placement", "map")
 """Each imports from itself and from those before it."""
 

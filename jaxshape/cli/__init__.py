@@ -11,6 +11,7 @@ leaves earlier output as it was. JAX, and all that needs it, is imported inside 
     inspecting inspect
     learning   dataset, train
     scoring    evaluate, plot
+    benchmarking bench
     viewing    view
     doctor     doctor
 """
@@ -29,6 +30,7 @@ from rich.markup import escape
 from tyro.conf import subcommand
 
 from jaxshape.claim import Output, claimed
+from jaxshape.cli.benchmarking import Bench
 from jaxshape.cli.common import console, warn
 from jaxshape.cli.completing import Complete
 from jaxshape.cli.doctor import Doctor
@@ -59,6 +61,7 @@ def commands(arguments: Sequence[str]) -> Any:
         | Annotated[Inspect, subcommand("inspect")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]
+        | Annotated[Bench, subcommand("bench")]
         | Annotated[ViewResult, subcommand("view")]
         | Annotated[Doctor, subcommand("doctor")]
     )

@@ -55,14 +55,13 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True)
 class Machines:
-    """All devices of a machine are used anyway. Several machines train together, one process on
-    each, where all see the dataset and the output folder; the first writes.
+    """All devices of a machine are used anyway. Several machines work together, one process on
+    each, where all see the same files.
 
-    Under Slurm: srun --ntasks-per-node=1 jaxshape train --distributed --dataset data/chairs
-    --output out/train
+    Under Slurm: srun --ntasks-per-node=1 jaxshape COMMAND --distributed ...
 
-    By hand, on the first of two (the other gets --process 1): jaxshape train --coordinator
-    FIRST-HOST:1234 --processes 2 --process 0 --dataset data/chairs --output out/train
+    By hand, on the first of two (the other gets --process 1): jaxshape COMMAND --coordinator
+    FIRST-HOST:1234 --processes 2 --process 0 ...
     """
 
     distributed: bool = False
@@ -80,13 +79,16 @@ class Machines:
         given = (self.coordinator, self.processes, self.process)
         return self.distributed or given != (None, None, None)
 
-    def join(self) -> None:
-        """Join the others, if there are any; to be called before JAX computes."""
+    def join(self, **how: Any) -> None:
+        """Join the others, if there are any; to be called before JAX computes.
+
+        `how` are further arguments of `join_processes`.
+        """
         count, index = self.processes, self.process
         if count is not None and index is not None:
             require(0 <= index < count, f"--process is {index} of {count}; they count from 0.")
         if self.asked:
-            process.join_processes(self.coordinator, count, index)
+            process.join_processes(self.coordinator, count, index, **how)
 
 
 class RefusedSetting(Exception):

@@ -46,12 +46,12 @@ class Rebuild:
     def __post_init__(self) -> None:
         checks.seed("seed", self.seed)
 
-    def prepare(self) -> tuple[Any, Any, RefineConfig]:
+    def prepare(self, family: FamilyName = "chair") -> tuple[Any, Any, RefineConfig]:
         """The prior, the search and its settings, so that bad options are refused before work."""
-        from jaxshape.model.weights import load_prior
+        from jaxshape.model.weights import load_prior, packaged_for
         from jaxshape.search.reconstruction import refiner_for
 
-        prior = load_prior(self.weights)
+        prior = load_prior(self.weights or packaged_for(family))
         return prior, refiner_for(self.method_for(prior), prior, self.search), self.search
 
     def placer(self, prior: Any) -> Any:
@@ -132,7 +132,7 @@ class Demo(Rebuild):
     """
 
     family: FamilyName = "chair"
-    """Class of the object, and of the weights where none are given."""
+    """Class of the object. Without --weights, tables too are rebuilt by the network for chairs."""
     frames: int = 6
     """Depth frames along the orbit, 20 degrees apart, 1 to 180: ten times around."""
     seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
@@ -155,7 +155,7 @@ class Demo(Rebuild):
         from jaxshape.search.reconstruction import require_measured
 
         seen = self.seen.config()
-        prior, refiner, config = self.prepare()
+        prior, refiner, config = self.prepare(self.family)
         with console.status(f"filming a {self.family}"):
             shown = Procedural(self.family, TEST_SEEDS + self.seed)
             grids, observation = self.film(shown.make(), seen, prior.resolution)

@@ -14,10 +14,13 @@ from tyro.conf import Positional
 
 from jaxshape.claim import Output
 from jaxshape.cli.common import progress_bar, report_skipped, require
-from jaxshape.cli.options import Axes, Seen, checked_numbers
+from jaxshape.cli.options import Axes, Machines, Seen, checked_numbers
 from jaxshape.data.config import FamilyName
 from jaxshape.files import write_json
 from jaxshape.search.config import RefineConfig
+
+PATIENCE = 30 * 24 * 3600
+"""Seconds that a process which is done waits for the others: shares of an evaluation differ."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Evaluate:
     """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
     family: FamilyName = "chair"
-    """Class of the procedural objects, and of the weights where none are given."""
+    """Class of the objects. Without --weights, tables too are rebuilt by the network for chairs."""
     count: int = 0
     """Number of procedural test objects to use instead of --meshes."""
     frames: str = "1,4,8,18"
@@ -49,17 +52,22 @@ class Evaluate:
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
     seed: int = 0
     """Seed of noise, surface samples and searches, 0 or more."""
+    machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
 
     @property
-    def writes(self) -> Output:
-        """What is written."""
-        return Output(self.output, is_file=True, goes_on=True)
+    def writes(self) -> Output | None:
+        """What is written; several processes share it."""
+        return None if self.machines.asked else Output(self.output, is_file=True, goes_on=True)
 
     def run(self) -> None:
+        self.machines.join(patience=PATIENCE)
+        import jax
+
         from jaxshape.data.archives import list_meshes
         from jaxshape.data.families import TEST_SEEDS, procedural_objects
-        from jaxshape.model.weights import load_prior
+        from jaxshape.model.weights import load_prior, packaged_for
         from jaxshape.results import evaluation
+        from jaxshape.results.journal import Share
 
         config = evaluation.EvaluateConfig(
             frames=checked_numbers(self.frames, "--frames"),
@@ -75,21 +83,26 @@ class Evaluate:
         )
         procedural = procedural_objects(self.family, self.count, TEST_SEEDS)
         sources = list_meshes(self.meshes) if self.meshes else procedural
-        prior = load_prior(self.weights or self.family)
+        packaged = packaged_for(self.family)
+        prior = load_prior(self.weights or packaged)
         evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
-        models, skipped = load_models(sources, self.axes)
+        share = Share(jax.process_index(), jax.process_count())
+        models, skipped = load_models(share.of(sources), self.axes, refuse=share.count == 1)
         if self.family == "chair":
             _check_upright(models, refuse=self.weights is None)
         about = {
             "meshes": str(self.meshes or f"{self.count} procedural {self.family}s"),
             **asdict(self.axes),
-            "weights": str(self.weights) if self.weights else f"{self.family} (packaged)",
+            "weights": str(self.weights) if self.weights else f"{packaged} (packaged)",
         }
-        score(self.output, prior, config, about, models, skipped)
+        names = [source.name for source in sources]
+        score(self.output, prior, config, about, models, skipped, names, share)
 
 
-def load_models(sources: Sequence[Any], axes: Axes) -> tuple[list[Any], list[Any]]:
-    """The meshes (`Model`) that can be used, and those that are `Skipped`."""
+def load_models(
+    sources: Sequence[Any], axes: Axes, *, refuse: bool = True
+) -> tuple[list[Any], list[Any]]:
+    """The meshes (`Model`) that can be used, and those `Skipped`; it may refuse to use none."""
     from jaxshape.data.dataset import load_object
     from jaxshape.data.meshes import Skipped
 
@@ -101,7 +114,7 @@ def load_models(sources: Sequence[Any], axes: Axes) -> tuple[list[Any], list[Any
     models = [f for f in found if not isinstance(f, Skipped)]
     report_skipped(skipped)
     require(
-        bool(models),
+        bool(models) or not refuse,
         f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
         f"{skipped[0].reason}. {skipped[0].detail}"
         if skipped
@@ -131,46 +144,72 @@ def score(
     about: dict[str, Any],
     models: Sequence[Any],
     skipped: Sequence[Any],
-) -> dict[str, Any]:
+    names: Sequence[str] | None = None,
+    share: Any = None,
+) -> dict[str, Any] | None:
     """Score models, write the results file, print its table; returns what the file holds.
 
     `config` is an `EvaluateConfig`; `about` says where meshes and weights come from. An evaluation
-    that was killed goes on when asked for again with the same weights and settings.
+    that was killed goes on when asked for again with the same weights and settings. Of several
+    processes each scores its share of all `names`, and whichever finishes last finds the rows of
+    the others and writes the file; the others return None. `share` is a `Share`; None for a single
+    process.
     """
     start = time.perf_counter()
     from jaxshape.data.meshes import Skipped
     from jaxshape.model.weights import fingerprint
     from jaxshape.results import evaluation
-    from jaxshape.results.journal import Journal
+    from jaxshape.results.journal import Share, journals_of
 
     resolved = {"noise": config.is_noisy, "fusion": config.fused_by}
     settings = asdict(config) | resolved | about
-    # Beside the results file until that is written.
-    partial = output.with_name(output.name + ".partial")
-    journal = Journal(partial, settings | {"fingerprint": fingerprint(prior)})
-    left = [model for model in models if model.name not in journal.rows]
+    stamp = settings | {"fingerprint": fingerprint(prior)}
+    names = [one.name for one in (*models, *skipped)] if names is None else names
+    journal = (share or Share()).journal(output, stamp)
+    scored = {name for name, row in _rows(output, stamp).items() if "skipped" not in row}
+    left = [model for model in models if model.name not in scored]
+    if skipped:
+        journal.add({one.name: {"skipped": one._asdict()} for one in skipped}, 0.0)
     with progress_bar("meshes") as bar:
-        task = bar.add_task("evaluate", total=len(models), completed=len(journal.rows), note="")
+        completed = len(models) - len(left)
+        task = bar.add_task("evaluate", total=len(models), completed=completed, note="")
         for scores in evaluation.evaluate(prior, left, config):
             if isinstance(scores, Skipped):
-                skipped = [*skipped, scores]
                 report_skipped([scores])
+                row = {scores.name: {"skipped": scores._asdict()}}
             else:
-                journal.add({scores["name"]: scores}, time.perf_counter() - start)
-                start = time.perf_counter()
+                row = {scores["name"]: scores}
+            journal.add(row, time.perf_counter() - start)
+            start = time.perf_counter()
             bar.update(task, advance=1)
-    require(bool(journal.rows), "No mesh could be scored; see the reasons above.")
-    per_mesh = list(journal.rows.values())
+    seconds, rows = sum(one.seconds for one in journals_of(output, stamp)), _rows(output, stamp)
+    if missing := [name for name in names if name not in rows]:
+        print(
+            f"{len(missing)} meshes are left to the other processes; the last one writes {output}."
+        )
+        return None
+    per_mesh = [rows[name] for name in names if "skipped" not in rows[name]]
     content = {
-        "config": settings | {"seconds": round(journal.seconds, 1)},
-        "skipped": [s._asdict() for s in skipped],
+        "config": settings | {"seconds": round(seconds, 1)},
+        "skipped": [rows[name]["skipped"] for name in names if "skipped" in rows[name]],
         "per_mesh": per_mesh,
-        "means": evaluation.summarize(per_mesh, config),
+        "means": evaluation.summarize(per_mesh, config) if per_mesh else {},
     }
-    write_json(output, content)
-    journal.remove()
+    if per_mesh:
+        write_json(output, content)
+    for one in journals_of(output, stamp):
+        one.remove()
+    require(bool(per_mesh), "No mesh could be scored; see the reasons above.")
     _print_table(content["means"], len(per_mesh))
     return content
+
+
+def _rows(output: Path, stamp: dict[str, Any]) -> dict[str, Any]:
+    """The rows of all processes so far; scores win over an earlier reason to skip a mesh."""
+    from jaxshape.results.journal import journals_of
+
+    found = [row for one in journals_of(output, stamp) for row in one.rows.items()]
+    return dict(sorted(found, key=lambda row: "skipped" not in row[1]))
 
 
 def _print_table(means: dict[str, Any], count: int) -> None:

@@ -34,8 +34,33 @@ def sum_chunks(function: Callable[..., Array], size: int, *examples: Array) -> A
     split = [_split(x, chunks, each) for x in examples]
     out: Any = jax.eval_shape(function, *[x[0] for x in split])
     add = lambda total, chunk: (total + function(*chunk), None)  # noqa: E731
-    total, _ = lax.scan(add, jnp.zeros(out.shape, jnp.float32), split)
+    total, _ = lax.scan(add, vary_like(jnp.zeros(out.shape, jnp.float32), split[0]), split)
     return total
+
+
+def vary_like(tree: PyTree, example: Array) -> PyTree:
+    """The same arrays, as different on each device of a `jax.shard_map` as an example is.
+
+    Loops want their first state to be of the type of the later ones, and under `jax.shard_map` that
+    says along which axes of the mesh an array may differ.
+
+    Args:
+        tree: Tree of arrays, constants among them.
+        example: An array that belongs to the examples.
+    """
+    axes = _axes_of(example)
+
+    def vary(x):
+        missing = tuple(axes - _axes_of(x))
+        return lax.pcast(x, missing, to="varying") if missing else x
+
+    return jax.tree.map(vary, tree)
+
+
+def _axes_of(x: Array) -> frozenset[str]:
+    """Axes along which an array may differ; JAX has had two names for them."""
+    kind: Any = jax.typeof(x)
+    return kind.vma if hasattr(kind, "vma") else kind.manual_axis_type.varying
 
 
 def _split(x: Array, chunks: int, each: int) -> Array:

@@ -189,7 +189,7 @@ def decode_prepared(
     return logits.reshape(*batch, *logits.shape[1:])
 
 
-def pick(tree: PyTree, index: Int[Array, " n"] | int) -> PyTree:
+def pick(tree: PyTree, index: Int[Array, "*n"] | int) -> PyTree:
     """Rows, or one row, of every array of a tree."""
     return jax.tree.map(lambda x: x[index], tree)
 

@@ -44,6 +44,11 @@ PACKAGED = ("chair", "chair-autoencoder")
 of the paper's auto-encoder."""
 
 
+def packaged_for(family: str) -> str:
+    """The package's weights for a family of objects: its own, those of chairs where it has none."""
+    return family if family in PACKAGED else "chair"
+
+
 class WeightsError(ValueError):
     """A weights file is missing, damaged, or of another model."""
 

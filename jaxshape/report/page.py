@@ -8,7 +8,7 @@ import base64
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
@@ -41,8 +41,6 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
         ValueError: There is no such folder.
     """
     found = read_folder(folder)
-    script = _beside("page.js")
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     scene = illustrations.scene(found)
     sections = [
         _warnings(found),
@@ -53,20 +51,53 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
         tables.frame_strip(found),
         tables.all_figures(found),
     ]
-    page = Template(_beside("page.html")).substitute(
-        title=escape(str(found.result.get("object", found.name))),
-        subtitle=escape(_subtitle(found)),
-        running=" · still running" if found.result.get("running") else "",
-        figures=_headline(found),
+    page = filled_page(
+        kind="jaxshape report" + (" · still running" if found.result.get("running") else ""),
+        title=str(found.result.get("object", found.name)),
+        subtitle=_subtitle(found),
+        figures=headline(found),
         body="\n".join(filter(None, sections)),
-        # In a script element, only this could end the data early.
-        scene=json.dumps(scene).replace("<", "\\u003c"),
-        script=script,
-        script_hash=f"sha256-{digest}",  # nothing else may run
+        scene=scene,
+        script=_beside("page.js"),
     )
     target = Path(folder) / "report.html"
     write_text(target, page)
     return target
+
+
+def filled_page(
+    *,
+    kind: str,
+    title: str,
+    subtitle: str,
+    figures: Iterable[tuple[str, str, str]],
+    body: str,
+    scene: Any = None,
+    script: str = "",
+) -> str:
+    """A page that needs no network; texts are escaped here, the body is HTML.
+
+    Args:
+        kind: What kind of page it is, in small print.
+        title: Its title.
+        subtitle: A line below the title.
+        figures: Name, value and meaning of each of the figures at its top.
+        body: Its sections, as HTML.
+        scene: What the script reads, as JSON can hold it.
+        script: A script of its own; nothing else may run.
+    """
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return Template(_beside("page.html")).substitute(
+        kind=escape(kind),
+        title=escape(title),
+        subtitle=escape(subtitle),
+        figures=_figures(figures),
+        body=body,
+        # In a script element, only this could end the data early.
+        scene=json.dumps(scene).replace("<", "\\u003c"),
+        script=script,
+        script_hash=f"sha256-{digest}",
+    )
 
 
 def _beside(name: str) -> str:
@@ -82,11 +113,11 @@ def _subtitle(found: ResultFolder) -> str:
     return " · ".join([f"folder {found.name}", *told])
 
 
-def _headline(found: ResultFolder) -> str:
+def _figures(figures: Iterable[tuple[str, str, str]]) -> str:
     return "\n".join(
         f"<div><dt>{escape(name)}</dt><dd><b>{escape(value)}</b>"
         f"<small>{escape(meaning)}</small></dd></div>"
-        for name, value, meaning in headline(found)
+        for name, value, meaning in figures
     )
 
 

@@ -57,7 +57,7 @@ def keyframe_table(keyframes: Sequence[KeyframeRecord]) -> str:
     }
     known = {heading: values for heading, values in cells.items() if any(values)}
     names = [escape(keyframe.name) for keyframe in keyframes]
-    table = _table(("keyframe", *known), zip(names, *known.values(), strict=True))
+    table = html_table(("keyframe", *known), zip(names, *known.values(), strict=True))
     about = f'<p class="soft">{ABOUT_COLUMNS}</p>'
     return _folded("Figures of each keyframe", about + table)
 
@@ -84,7 +84,7 @@ def frame_strip(found: ResultFolder) -> str:
         for status, color in STATUS_COLORS.items()
         if status in present
     )
-    table = _table(("frames", "number", "status", "reason"), rows)
+    table = html_table(("frames", "number", "status", "reason"), rows)
     return f"""<section><h2>Frames of the recording</h2>
 <svg class="strip" role="img" aria-label="Status of each frame, in the order of the recording"
 viewBox="0 0 {start} 1" preserveAspectRatio="none">{"".join(runs)}</svg>
@@ -101,16 +101,22 @@ def all_figures(found: ResultFolder) -> str:
             yield escape(prefix[:-1]), escape(json.dumps(value))
 
     rows = list(flat("", found.result))
-    return _folded("All of result.json", _table(("figure", "value"), rows)) if rows else ""
+    return _folded("All of result.json", html_table(("figure", "value"), rows)) if rows else ""
 
 
 def _folded(summary: str, content: str) -> str:
     return f"<section><details><summary>{summary}</summary>{content}</details></section>"
 
 
-def _table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of cells that are escaped already."""
-    head = "".join(f"<th>{name}</th>" for name in heading)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+def html_table(
+    heading: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()
+) -> str:
+    """A table of cells that are escaped already; columns of `numbers` are set flush right."""
+    right = lambda i: ' class="number"' if i in numbers else ""  # noqa: E731
+    head = "".join(f"<th{right(i)}>{name}</th>" for i, name in enumerate(heading))
+    body = "".join(
+        "<tr>" + "".join(f"<td{right(i)}>{cell}</td>" for i, cell in enumerate(row)) + "</tr>"
+        for row in rows
+    )
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
     return f'<div class="scroll">{table}</div>'

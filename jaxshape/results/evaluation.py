@@ -23,6 +23,7 @@ from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.results.metrics import bounds, occluded_scores, shape_scores
 from jaxshape.search.config import RefineConfig
+from jaxshape.search.devices import over_devices
 from jaxshape.search.reconstruction import (
     Reconstruction,
     all_measured,
@@ -32,7 +33,7 @@ from jaxshape.search.reconstruction import (
 )
 
 OBJECTS_AT_A_TIME = 16
-"""Objects refined together: enough to fill a machine, few enough to show progress."""
+"""Objects refined together on each device: enough to fill it, few enough to show progress."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def evaluate(
         nothing was measured is `Skipped`.
     """
     run, fit = by_each_method(prior, config), jax.jit(fit_surface)
-    group = max(1, OBJECTS_AT_A_TIME // len(config.frames))
+    group = max(1, OBJECTS_AT_A_TIME * jax.local_device_count() // len(config.frames))
     size = min(group, len(models)) * len(config.frames)
     for start in range(0, len(models), group):
         observed = [
@@ -182,15 +183,15 @@ def by_each_method(
     """
     refiners = {name: refiner_for(name, prior, config.refine) for name in config.methods}
 
-    @jax.jit
-    def run(keys, prior, grids):
+    def run(prior, rows):
+        keys, grids = rows
         F, M = grids.occupied, grids.occluded
         return {
             name: reconstruct(keys, prior, F, M, refiner, config.refine)
             for name, refiner in refiners.items()
         }
 
-    return run
+    return jax.jit(lambda keys, prior, grids: over_devices(run, prior, (keys, grids)))
 
 
 def case_keys(name: str, frames: Sequence[int], seed: int = 0) -> Key[Array, " case"]:

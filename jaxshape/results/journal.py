@@ -1,8 +1,10 @@
 """Rows of a long run, kept as they come: a killed run goes on after its last row. [host]"""
 
 import json
+from collections.abc import Sequence
+from glob import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxshape import reading
 from jaxshape.files import write_text
@@ -44,6 +46,47 @@ class Journal:
     def remove(self) -> None:
         """Remove the file, where what the rows come to stands elsewhere."""
         self.path.unlink(missing_ok=True)
+
+
+class Share(NamedTuple):
+    """What one of several processes does of a list: every n-th entry.
+
+    Attributes:
+        index: Number of the process, from 0.
+        count: Number of processes, 1 or more.
+    """
+
+    index: int = 0
+    count: int = 1
+
+    def of(self, items: Sequence[Any]) -> list[Any]:
+        """The entries that are this process's.
+
+        Args:
+            items: The list, the same for all processes.
+        """
+        return list(items[self.index :: self.count])
+
+    def journal(self, output: Path, settings: dict[str, Any]) -> Journal:
+        """The journal of this process beside a results file, until that is written.
+
+        Args:
+            output: The results file.
+            settings: Settings under which its rows are made.
+        """
+        number = f".{self.index}-of-{self.count}" if self.count > 1 else ""
+        return Journal(output.with_name(f"{output.name}.partial{number}"), settings)
+
+
+def journals_of(output: Path, settings: dict[str, Any]) -> list[Journal]:
+    """The journals of all processes beside a results file, however many there were.
+
+    Args:
+        output: The results file.
+        settings: Settings under which the rows were made; journals of others have no rows.
+    """
+    paths = output.parent.glob(f"{escape(output.name)}.partial*")
+    return [Journal(path, settings) for path in sorted(paths)]
 
 
 def _read(path: Path) -> dict[str, Any]:

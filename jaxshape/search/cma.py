@@ -17,7 +17,6 @@ from jaxtyping import Array, Float, Int
 from jaxshape.checks import positive, whole
 from jaxshape.search import stopping
 from jaxshape.search.batching import apply_if
-from jaxshape.search.config import is_array
 from jaxshape.search.rates import Constants, constants, default_population
 from jaxshape.search.refiner import (
     Candidate,
@@ -74,8 +73,7 @@ def checked_population(dim: int, sigma0: Float[Array, ""] | float, population: i
         ValueError: A setting is outside its range.
     """
     whole("dim", dim, 1)
-    if not is_array(sigma0):
-        positive("sigma0", sigma0)
+    positive("sigma0", sigma0)
     if population is None:
         return default_population(dim)
     whole("population", population, 3)  # CMA-ES ranks candidates

@@ -2,11 +2,18 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from jaxshape.checks import at_least, one_of, positive, whole, within
 from jaxshape.limits import POPULATION, STEPS
 from jaxshape.model.config import Precision
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    Number = float | Array
+else:
+    Number = float  # JAX is not imported, and the command line reads its options from the types
 
 ObjectiveName = Literal["balanced", "paper", "soft"]
 Space = Literal["whitened", "raw"]
@@ -21,14 +28,12 @@ def objective_for(fusion: str) -> ObjectiveName:
     return "soft" if fusion == "distance" else "balanced"
 
 
-def is_array(value: Any) -> bool:
-    """Whether a setting is a JAX array, which may be traced, so that its value is not known."""
-    return hasattr(value, "aval")
-
-
 @dataclass(frozen=True)
 class RefineConfig:
     """Settings of a search for the shape of an object.
+
+    All that are numbers and no counts may be traced by JAX, so that `jax.vmap` searches with many
+    values in one program (docs/examples/sweep.py); their values are then not checked.
 
     Attributes:
         objective: The residual that is minimised: `paper` is Eq. 7 as printed; in `balanced`
@@ -57,20 +62,19 @@ class RefineConfig:
             where the measured halves agree (not in the paper). The search itself is the same.
 
     Raises:
-        ValueError: A setting is outside its range. Arrays of JAX, which may be traced, are not
-            checked.
+        ValueError: A setting is outside its range.
     """
 
     objective: ObjectiveName | None = None
     iterations: int = 350
     population: int = 17
-    sigma0: float = 0.1
-    step_size: float | None = None
+    sigma0: Number = 0.1
+    step_size: Number | None = None
     space: Space = "whitened"
-    bound: float | None = None
-    prior_weight: float = 0.0
-    tolerance: float = 1e-6
-    target: float | None = None
+    bound: Number | None = None
+    prior_weight: Number = 0.0
+    tolerance: Number = 1e-6
+    target: Number | None = None
     precision: Precision = "float32"
     symmetry: bool = True
 
@@ -84,10 +88,9 @@ class RefineConfig:
         whole("population", self.population, 3, POPULATION, "each is a shape to decode")
         for name in ("sigma0", "step_size", "bound"):
             value = getattr(self, name)
-            if not (is_array(value) or (value is None and name != "sigma0")):
+            if value is not None or name == "sigma0":
                 positive(name, value)
         for name in ("prior_weight", "tolerance"):
-            if not is_array(getattr(self, name)):
-                at_least(name, getattr(self, name), 0)
-        if not (self.target is None or is_array(self.target)):
+            at_least(name, getattr(self, name), 0)
+        if self.target is not None:
             within("target", self.target, -math.inf, math.inf)

@@ -42,7 +42,8 @@ def find_build(name: str) -> tuple[Build, str | None]:
     """
     family, _, variant = name.partition(":")
     if family in _own():
-        return importlib.import_module(f"{__package__}.methods.{family}").build, variant or None
+        module = importlib.import_module(f"{__package__}.methods.{family.replace('-', '_')}")
+        return module.build, variant or None
     if family in _offered():
         offered = _offered()[family]
         return _imported(name, offered.module, offered.attr), variant or None
@@ -57,9 +58,9 @@ def find_build(name: str) -> tuple[Build, str | None]:
 
 
 def _own() -> list[str]:
-    """The modules of `methods/`, found as files."""
+    """The modules of `methods/`, found as files; a name has - where the module has _."""
     folder = Path(__file__).parent / "methods"
-    return [module.name for module in pkgutil.iter_modules([str(folder)])]
+    return [module.name.replace("_", "-") for module in pkgutil.iter_modules([str(folder)])]
 
 
 def _offered() -> dict[str, EntryPoint]:

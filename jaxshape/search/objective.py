@@ -1,6 +1,7 @@
 """The objective of a search: shape model, residual and penalty as one function of a code."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,27 +9,46 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxshape.geometry.grids import Grids
+from jaxshape.model.chunks import vary_like
 from jaxshape.model.shapes import Precision, Prepared, ShapeModel, ShapePrior, pick
+from jaxshape.search.curvature import Composed, Expansion, lanczos
 from jaxshape.search.residuals import BALANCED, Residual
-from jaxshape.search.rows import hoisted, loss_over_rows, one_network, over_rows
+from jaxshape.search.rows import hoisted, loss_over_rows, of_one_row, one_network, over_rows
+from jaxshape.search.space import LatentSpace, raw
 
 # What a code costs besides its residual, in nats per voxel.
 Penalty = Callable[[Float[Array, " d"]], Float[Array, ""]]
+
+
+class Own(NamedTuple):
+    """What the objective of one object has of its own; leading axes are batch axes.
+
+    Attributes:
+        features: Features of its measurement, as the model prepared them.
+        target: Target of its residual.
+        weight: Weight of the penalty.
+    """
+
+    features: PyTree
+    target: PyTree
+    weight: Float[Array, "*batch"]
 
 
 class Evaluation(NamedTuple):
     """Scoring of codes, for any objects.
 
     Attributes:
-        loss: `(shared, code [d], own) -> loss`, under any `jax.vmap`s and `jax.grad`; `own` holds
-            the features and the target of the code's object.
+        loss: `(shared, code [d], own) -> loss`, under any `jax.vmap`s and `jax.grad`.
         shape: `(shared, codes [n d], own [m ...], owner [n]) -> logits [n x y z], losses [n]`.
+        expansion: `(directions, shared, code [d], own, chain [d d]) -> Expansion` in points, under
+            any `jax.vmap`s; `chain` is the Jacobian of the code by the point.
         shared: Arrays that all objects share: prepared parameters, and the constants of the
-            penalty.
+            residual and the penalty.
     """
 
     loss: Callable[..., Float[Array, ""]]
     shape: Callable[..., tuple[Array, Array]]
+    expansion: Callable[..., Expansion]
     shared: PyTree
 
 
@@ -38,7 +58,7 @@ def evaluation(
     residual: Residual,
     penalty: Penalty | None,
     code: Float[Array, " d"],
-    own: tuple[PyTree, PyTree],
+    own: Own,
 ) -> Evaluation:
     """Join a model, a residual and a penalty.
 
@@ -48,27 +68,69 @@ def evaluation(
         residual: The residual that scores logits.
         penalty: `code -> ` nats per voxel to add; None for no penalty.
         code: A code `[d]`, as an example of its shape.
-        own: Features and target of an object, as examples of their shapes.
+        own: What an object has of its own, as an example of its shapes.
     """
 
-    def price(code, logits, target):
+    def price(code, logits, target, weight):
         loss = residual.score(logits, target)
-        return loss if penalty is None else loss + penalty(code)
+        return loss if penalty is None else loss + weight * penalty(code)
 
-    row = jax.eval_shape(lambda own: jax.tree.map(lambda x: x[None], own), own[0])
+    row = jax.eval_shape(lambda own: jax.tree.map(lambda x: x[None], own), own.features)
     logits = jax.eval_shape(model.decode, Prepared(prepared.shared, row), code[None])
-    one = jax.ShapeDtypeStruct(logits.shape[1:], logits.dtype)
-    priced, constants = hoisted(price, code, one, own[1])
+    one = vary_like(jnp.zeros(logits.shape[1:], logits.dtype), code)
+    priced, constants = hoisted(price, code, one, own.target, own.weight)
 
     def shape(shared, codes, own):
         network, constants = shared
-        features, target = own
-        logits = model.decode(Prepared(network, features), codes)
-        losses = jax.vmap(priced, (None, 0, 0, 0))(constants, codes, logits, target)
+        logits = model.decode(Prepared(network, own.features), codes)
+        prices = jax.vmap(partial(priced, constants))
+        losses = prices(codes, logits, own.target, own.weight)
         return logits, losses.astype(codes.dtype)
 
+    def expansion(directions, shared, codes, own_and_chain):
+        network, constants = shared
+        own, chain = own_and_chain
+        prices = jax.vmap(partial(priced, constants))
+
+        def decoded(steps):
+            moved = codes + jnp.einsum("nij,nj->ni", chain, steps, precision="highest")
+            return moved, model.decode(Prepared(network, own.features), moved)
+
+        def slopes_of(codes, logits):
+            losses, pull = jax.vjp(lambda *x: prices(*x, own.target, own.weight), codes, logits)
+            return pull(jnp.ones_like(losses)), losses
+
+        found, pull = jax.vjp(decoded, jnp.zeros_like(codes))
+        slopes, bend, losses = jax.vjp(slopes_of, *found, has_aux=True)
+        # J v is the transpose of the transpose: decoders need derivatives in reverse only.
+        _, push = jax.vjp(
+            lambda cotangents: pull(cotangents)[0], jax.tree.map(jnp.zeros_like, found)
+        )
+        product = lambda v: pull(bend(push(v)[0]))[0]  # noqa: E731
+        slope = pull(slopes)[0]
+        return Expansion(losses.astype(codes.dtype), slope, *lanczos(product, slope, directions))
+
+    def expansion_of_one(directions, shared, code, own, chain):
+        return of_one_row(partial(expansion, directions), shared, code, (own, chain))
+
     loss = loss_over_rows(lambda shared, codes, own: shape(shared, codes, own)[1])
-    return Evaluation(loss, over_rows(shape), (prepared.shared, constants))
+    return Evaluation(loss, over_rows(shape), expansion_of_one, (prepared.shared, constants))
+
+
+def composed(how: Evaluation, space: LatentSpace, own: Own) -> Composed:
+    """The objective of one object as a function of the points of a space.
+
+    Args:
+        how: The scoring of codes.
+        space: Coordinates of the search.
+        own: What the object has of its own.
+    """
+
+    def expansion(point, directions):
+        chain = jax.jacobian(space.to_code)(point)
+        return how.expansion(directions, how.shared, space.to_code(point), own, chain)
+
+    return Composed(lambda point: how.loss(how.shared, space.to_code(point), own), expansion)
 
 
 def objective(
@@ -77,6 +139,7 @@ def objective(
     *,
     residual: Residual = BALANCED,
     penalty: Penalty | None = None,
+    penalty_weight: Float[Array, ""] | float = 1.0,
     grids: Grids | None = None,
     precision: Precision = "float32",
 ) -> Callable[[Float[Array, " d"]], Float[Array, ""]]:
@@ -90,25 +153,29 @@ def objective(
         target: Target of the object, `residual.target(grids, first_logits)`.
         residual: The residual that the target belongs to.
         penalty: `code [d] -> ` nats per voxel to add to the residual; None for no penalty.
+        penalty_weight: Factor of the penalty, 0 or more.
         grids: F and M of the object `[x y z]`, for models whose decoder takes the measurement; None
             for models that decode from the code alone.
         precision: Precision of the decoder's matrix products, `float32` or `bfloat16`.
 
     Returns:
-        `loss(code [d]) -> ` nats per voxel, differentiable; NaN for a code that is not finite.
+        `loss(code [d]) -> ` nats per voxel, differentiable; NaN for a code that is not finite. A
+        `gauss_newton` search finds its Gauss-Newton matrix, too.
 
     Raises:
         ValueError: `jax.vmap` batches the parameters of the prior.
     """
     batch = None if grids is None else jax.tree.map(lambda x: jnp.asarray(x)[None], grids)
     prepared = prepare_one(prior, batch, precision)
-    own = pick(prepared.own, 0), target
+    own = Own(pick(prepared.own, 0), target, jnp.asarray(penalty_weight, jnp.float32))
 
-    def loss(code):
+    def about(code):
         how = evaluation(prior.model, prepared, residual, penalty, code, own)
-        return how.loss(how.shared, code, own)
+        return composed(how, raw(prior)._replace(mean=jnp.zeros_like(code)), own)
 
-    return loss
+    return Composed(
+        lambda code: about(code)(code), lambda code, count: about(code).expansion(code, count)
+    )
 
 
 def prepare_one(prior: ShapePrior, grids: Grids | None, precision: Precision) -> Prepared:

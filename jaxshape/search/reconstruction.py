@@ -9,15 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxshape.checks import is_traced
 from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.search.composition import complete
 from jaxshape.search.config import RefineConfig, objective_for
+from jaxshape.search.devices import over_devices
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty
 from jaxshape.search.refiner import Refiner, Trace
 from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual
-from jaxshape.search.run import refine
+from jaxshape.search.run import Callback, one_key_each, refine
 from jaxshape.search.space import LatentSpace, raw, whitened
 
 
@@ -105,7 +107,7 @@ def residual_for(grids: Grids, config: RefineConfig) -> Residual:
     return RESIDUALS[config.objective or objective_for("distance" if is_soft else "points")]
 
 
-def code_penalty(prior: ShapePrior, weight: float) -> Penalty | None:
+def code_penalty(prior: ShapePrior) -> Penalty:
     """The cost of a code for its distance from the codes of the training set.
 
     It is half the squared Mahalanobis distance, the negative log-density up to a constant, in nats
@@ -113,15 +115,9 @@ def code_penalty(prior: ShapePrior, weight: float) -> Penalty | None:
 
     Args:
         prior: The shape prior.
-        weight: Weight of the codes' prior density, 0 or more.
-
-    Returns:
-        The penalty; None for weight 0.
     """
-    if isinstance(weight, int | float) and weight == 0:
-        return None
     space, voxels = whitened(prior), prior.resolution**3
-    return lambda code: weight / voxels * 0.5 * jnp.sum(space.from_code(code) ** 2)
+    return lambda code: 0.5 / voxels * jnp.sum(space.from_code(code) ** 2)
 
 
 def reconstruct(
@@ -135,8 +131,12 @@ def reconstruct(
     residual: Residual | None = None,
     earlier: Float[Array, "object d"] | None = None,
     data: Any = None,
+    callback: Callback | None = None,
+    devices: int | None = None,
 ) -> Reconstruction:
     """Rebuild a batch of objects from their measurement grids F and occlusion masks M.
+
+    Objects are spread over all devices of the process (`jaxshape.search.devices`).
 
     Args:
         keys: One random key for each object `[object]`, or one for all.
@@ -150,6 +150,9 @@ def reconstruct(
             they explain the grids better than the first code does. None starts from the first code.
         data: Further arrays that your own model or residual needs of each object, as a pytree whose
             arrays have a leading axis over objects: `grids.data` of `residual.target` and `encode`.
+        callback: `(objects [n], iterations [n], trace [n ...])`, called on the host after each
+            iteration of the search (`refine`); None costs nothing.
+        devices: Devices of this process to spread objects over, 1 or more; None for all.
 
     Raises:
         ValueError: The grids have no batch axis, differ in shape, or are not of the prior's
@@ -158,56 +161,65 @@ def reconstruct(
     grids = Grids(occupied, occluded, data)
     require_batch(grids)
     residual = residual_for(grids, config) if residual is None else residual
-    first_code = encode(prior, grids)
-    first_logits = decode(prior, first_code, grids)
-    targets = jax.vmap(residual.target)(grids, first_logits)
-    score = jax.vmap(residual.score)
-    first_objective = score(first_logits, targets)
-    start, start_objective = first_code, first_objective
-    if earlier is not None:
-        again = score(decode(prior, earlier, grids), targets)
-        start = jnp.where((again < first_objective)[:, None], earlier, first_code)
-        start_objective = jnp.minimum(again, first_objective)
-    if refiner is None:
-        code, logits, objective, found = first_code, first_logits, first_objective, None
-    else:
-        # A prior adds to the objective, and a bound may move the first code.
-        is_first_loss = config.prior_weight == 0 and config.bound is None
-        found = refine(
-            keys,
-            prior,
-            start,
-            targets,
-            refiner,
-            config.iterations,
-            residual=residual,
-            grids=grids,
-            space=search_space(prior, config),
-            penalty=code_penalty(prior, config.prior_weight),
-            first_losses=start_objective if is_first_loss else None,
-            target_loss=config.target,
-            precision=config.precision,
+
+    def rebuild(prior, rows):
+        keys, grids, earlier = rows
+        first_code = encode(prior, grids)
+        first_logits = decode(prior, first_code, grids)
+        targets = jax.vmap(residual.target)(grids, first_logits)
+        score = jax.vmap(residual.score)
+        first_objective = score(first_logits, targets)
+        start, start_objective = first_code, first_objective
+        if earlier is not None:
+            again = score(decode(prior, earlier, grids), targets)
+            start = jnp.where((again < first_objective)[:, None], earlier, first_code)
+            start_objective = jnp.minimum(again, first_objective)
+        if refiner is None:
+            code, logits, objective, found = first_code, first_logits, first_objective, None
+        else:
+            # A prior adds to the objective, and a bound may move the first code.
+            has_prior = is_traced(config.prior_weight) or config.prior_weight > 0
+            found = refine(
+                keys,
+                prior,
+                start,
+                targets,
+                refiner,
+                config.iterations,
+                residual=residual,
+                grids=grids,
+                space=search_space(prior, config),
+                penalty=code_penalty(prior) if has_prior else None,
+                penalty_weight=config.prior_weight if has_prior else 1.0,
+                first_losses=None if has_prior or config.bound is not None else start_objective,
+                target_loss=config.target,
+                callback=callback,
+                devices=devices,
+                precision=config.precision,
+            )
+            code, logits, objective = found.code, found.logits, score(found.logits, targets)
+        conditional = prior.model.conditional
+        filled = complete(grids, logits, symmetry=config.symmetry, conditional=conditional)
+        return Reconstruction(
+            first_code=first_code,
+            code=code,
+            completed_first=first_logits > 0,
+            logits=logits,
+            completed=logits > 0,
+            composed=filled.composed,
+            fill_logits=filled.logits,
+            symmetric=filled.symmetric,
+            agreement=filled.agreement,
+            first_objective=first_objective,
+            objective=objective,
+            trace=found and found.trace,
+            path=found and found.path,
+            iterations=found and found.iterations,
+            stop=found and found.stop,
         )
-        code, logits, objective = found.code, found.logits, score(found.logits, targets)
-    conditional = prior.model.conditional
-    filled = complete(grids, logits, symmetry=config.symmetry, conditional=conditional)
-    return Reconstruction(
-        first_code=first_code,
-        code=code,
-        completed_first=first_logits > 0,
-        logits=logits,
-        completed=logits > 0,
-        composed=filled.composed,
-        fill_logits=filled.logits,
-        symmetric=filled.symmetric,
-        agreement=filled.agreement,
-        first_objective=first_objective,
-        objective=objective,
-        trace=found and found.trace,
-        path=found and found.path,
-        iterations=found and found.iterations,
-        stop=found and found.stop,
-    )
+
+    rows = one_key_each(keys, len(grids.occupied)), grids, earlier
+    return over_devices(rebuild, prior, rows, devices)
 
 
 @cache
@@ -246,19 +258,23 @@ def fit_surface(
         ValueError: The grids have no batch axis or are not of the prior's resolution.
     """
     config = RefineConfig(iterations=iterations, space="raw", tolerance=0.0)
-    grids = Grids(surface, jnp.zeros_like(surface))
-    require_batch(grids)
-    found = refine(
-        jax.random.key(0),  # Adam draws no numbers
-        prior,
-        encode(prior, grids),
-        jax.vmap(BALANCED.target)(grids, jnp.zeros(surface.shape)),
-        build_refiner("gradient:adam", prior.code_size, config),
-        iterations,
-        grids=grids,
-        space=search_space(prior, config),
-    )
-    return found.logits > 0
+    require_batch(Grids(surface, surface))
+
+    def fit(prior, surface):
+        grids = Grids(surface, jnp.zeros_like(surface))
+        found = refine(
+            jax.random.key(0),  # Adam draws no numbers
+            prior,
+            encode(prior, grids),
+            jax.vmap(BALANCED.target)(grids, jnp.zeros(surface.shape)),
+            build_refiner("gradient:adam", prior.code_size, config),
+            iterations,
+            grids=grids,
+            space=search_space(prior, config),
+        )
+        return found.logits > 0
+
+    return over_devices(fit, prior, surface)
 
 
 def require_batch(grids: Grids) -> None:

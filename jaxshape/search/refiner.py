@@ -19,10 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxshape.search.batching import select
-
-# The loss of one point, in the point's own type; a refiner calls it under `jax.vmap` or `jax.grad`.
-# A point that is not finite costs nothing and has the loss NaN.
-Objective = Callable[[Float[Array, " d"]], Float[Array, ""]]
+from jaxshape.search.curvature import Objective, only_where
 
 
 class StopReason(IntEnum):
@@ -114,6 +111,9 @@ class Refiner(NamedTuple):
     loss may not have been evaluated. `stop` is a `StopReason`; a search without criteria of its
     own leaves it at RUNNING. Numbers have the type of the point, counters are int32.
 
+    An objective is called under `jax.vmap` or `jax.grad`; those of `refine` have a Gauss-Newton
+    matrix, too (`jaxshape.search.curvature.expand`).
+
     Attributes:
         init: `(key, point [d], loss) -> state, trace`. It takes the loss of the first point, so
             that `best` is never worse than the start and no iteration spends an evaluation on it.
@@ -145,8 +145,8 @@ def advance(
         State and trace after the iteration; the same as before where the search has stopped.
     """
     running = state.stop == StopReason.RUNNING
-    awake = lambda point: objective(jnp.where(running, point, jnp.nan))  # noqa: E731
-    return select(running, refiner.step(key, state, awake), (state, trace))
+    stepped = refiner.step(key, state, only_where(running, objective))
+    return select(running, stepped, (state, trace))
 
 
 def finite_or_inf(losses: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -91,7 +91,7 @@ def with_restarts(
     kind: Literal["ipop", "bipop"],
     *,
     dim: int,
-    sigma0: float,
+    sigma0: Float[Array, ""] | float,
     population: int | None = None,
     doublings: int = 5,
     restart_point: Callable[[Array, Float[Array, " d"]], Float[Array, " d"]] | None = None,

@@ -20,7 +20,7 @@ from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Float, PyTree
 
-from jaxshape.model.chunks import in_chunks
+from jaxshape.model.chunks import in_chunks, vary_like
 from jaxshape.model.shapes import pick
 
 Score = Callable[[PyTree, Float[Array, "n d"], PyTree], PyTree]
@@ -50,17 +50,12 @@ def loss_over_rows(
         found, pull_back = jax.vjp(lambda codes: losses(shared, codes, own), codes)
         return found, pull_back(jnp.ones_like(found))[0]
 
-    scored = over_rows(losses, at_a_time)
-    scored_with_slopes = over_rows(losses_and_slopes, at_a_time)
-    first = jnp.zeros(1, jnp.int32)
-
     @jax.custom_vjp
     def loss(shared, code, own):
-        return scored(shared, code[None], _add_axis(own), first)[0]
+        return of_one_row(losses, shared, code, own, at_a_time)
 
     def with_slope(shared, code, own):
-        found, slopes = scored_with_slopes(shared, code[None], _add_axis(own), first)
-        return found[0], slopes[0]
+        return of_one_row(losses_and_slopes, shared, code, own, at_a_time)
 
     loss.defvjp(with_slope, lambda slope, ct: (None, ct * slope, None))
     return loss
@@ -109,6 +104,27 @@ def over_rows(score: Score, at_a_time: Mapping[str, int] = ROWS_AT_A_TIME) -> Ca
     return scored
 
 
+def of_one_row(
+    score: Score,
+    shared: PyTree,
+    code: Float[Array, " d"],
+    own: PyTree,
+    at_a_time: Mapping[str, int] = ROWS_AT_A_TIME,
+) -> PyTree:
+    """The score of one code of one object, in bounded memory under any nest of `jax.vmap`s.
+
+    Args:
+        score: Scores rows.
+        shared: Constants that all rows share.
+        code: The code `[d]`.
+        own: What belongs to its object.
+        at_a_time: Rows that are scored together, by platform.
+    """
+    rows = jax.tree.map(lambda x: x[None], own)
+    found = over_rows(score, at_a_time)(shared, code[None], rows, jnp.zeros(1, jnp.int32))
+    return pick(found, 0)
+
+
 def _by_chunks(score: Score, size: int, shared, codes, own, owner) -> PyTree:
     """Score the rows `size` at a time; a chunk without a finite code is passed over.
 
@@ -118,6 +134,7 @@ def _by_chunks(score: Score, size: int, shared, codes, own, owner) -> PyTree:
     def chunk(rows, wanted):
         shapes = jax.eval_shape(score, shared, codes[rows], pick(own, owner[rows]))
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
+        nothing = vary_like(nothing, codes)
 
         def compute():
             found = score(shared, codes[rows], pick(own, owner[rows]))
@@ -128,13 +145,11 @@ def _by_chunks(score: Score, size: int, shared, codes, own, owner) -> PyTree:
     return in_chunks(chunk, size, jnp.arange(len(codes)), jnp.all(jnp.isfinite(codes), axis=-1))
 
 
-def _add_axis(own: PyTree) -> PyTree:
-    return jax.tree.map(lambda x: x[None], own)
-
-
 @custom_vmap
 def one_network(shared: PyTree) -> PyTree:
     """The constants of a search, of which a batch has one for all: the identity.
+
+    They are the network, and what a residual and a penalty close over.
 
     Raises:
         ValueError: `jax.vmap` batches them. A search over several networks is `jax.lax.map`.
@@ -146,9 +161,10 @@ def one_network(shared: PyTree) -> PyTree:
 def _refuse_networks(size: int, batched: PyTree, shared: PyTree) -> tuple[PyTree, PyTree]:
     if any(jax.tree.leaves(batched)):
         raise ValueError(
-            f"jax.vmap was asked to search with {size} networks at once, but a search shares one "
-            "network among all objects and candidates. Use jax.lax.map, or a loop, over networks; "
-            "and prepare a network outside of lax.cond."
+            f"jax.vmap was asked to search with {size} networks at once, or with a residual or a "
+            f"penalty that closes over {size} different arrays; but a search shares these among "
+            "all objects and candidates. Use jax.lax.map, or a loop, over them, or penalty_weight "
+            "for the weight of a penalty; and prepare a network outside of lax.cond."
         )
     return shared, batched
 
@@ -160,7 +176,7 @@ def hoisted(function: Callable[..., Array], *examples: Any) -> tuple[Callable[..
 
     Args:
         function: Returns one array.
-        examples: Arguments of the shapes that it will be called with.
+        examples: Arguments like those that it will be called with.
 
     Returns:
         `pure(constants, *arguments)`, and the constants.

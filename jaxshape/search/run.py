@@ -1,18 +1,28 @@
 """The refinement loop: many objects, each with its population, in one compiled program."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from jaxshape.geometry.grids import Grids
+from jaxshape.model.chunks import vary_like
 from jaxshape.model.shapes import Precision, ShapePrior, pick
-from jaxshape.search.objective import Evaluation, Penalty, evaluation, prepare_one
+from jaxshape.search.devices import numbers, over_devices
+from jaxshape.search.objective import (
+    Evaluation,
+    Own,
+    Penalty,
+    composed,
+    evaluation,
+    prepare_one,
+)
 from jaxshape.search.refiner import (
-    Objective,
     Refiner,
     StopReason,
     Trace,
@@ -20,6 +30,7 @@ from jaxshape.search.refiner import (
     finite_or_inf,
 )
 from jaxshape.search.residuals import BALANCED, Residual
+from jaxshape.search.rows import one_network
 from jaxshape.search.space import LatentSpace, raw
 
 
@@ -33,10 +44,11 @@ class Refined(NamedTuple):
         trace: Figures of each iteration `[object iteration ...]`; constant once the object's search
             has stopped.
         path: The best code so far, after each iteration `[object iteration d]`.
-        iterations: Iterations that the search took before it stopped `[object]`.
+        iterations: Iterations that the search took before it stopped `[object]`, those of
+            `previous` included.
         stop: Why the search stopped `[object]`, as a `StopReason`.
         state: State of the refiner, one for each object; a later search can start from it
-            (`previous`).
+            (`warm_start`).
     """
 
     code: Float[Array, "object d"]
@@ -47,6 +59,11 @@ class Refined(NamedTuple):
     iterations: Int[Array, " object"]
     stop: Int[Array, " object"]
     state: Any
+
+
+# What a callback is given after each iteration: numbers of the objects [n], how many iterations
+# each of them has taken [n], and its trace [n ...], as NumPy arrays.
+Callback = Callable[[np.ndarray, np.ndarray, Trace], None]
 
 
 def refine(
@@ -61,15 +78,20 @@ def refine(
     grids: Grids | None = None,
     space: LatentSpace | None = None,
     penalty: Penalty | None = None,
+    penalty_weight: Float[Array, ""] | float = 1.0,
     first_losses: Float[Array, " object"] | None = None,
     target_loss: Float[Array, ""] | float | None = None,
-    previous: Any = None,
+    previous: Refined | None = None,
+    warm_start: Any = None,
+    callback: Callback | None = None,
+    devices: int | None = None,
     precision: Precision = "float32",
 ) -> Refined:
     """Search from each object's first code for one that explains its target better (section 3.3).
 
     All candidates of all objects go through the decoder in one call per iteration. An object whose
-    search has stopped is frozen and no longer decoded.
+    search has stopped is frozen and no longer decoded. Objects are spread over all devices of the
+    process (`jaxshape.search.devices`).
 
     Args:
         keys: One random key for each object `[object]`, or one for all, which is split. The result
@@ -85,82 +107,168 @@ def refine(
             measurement; None for models that decode from the code alone.
         space: Coordinates of the search; None for the codes themselves.
         penalty: `code [d] -> ` nats per voxel, added to the residual; None for no penalty.
+        penalty_weight: Factor of the penalty, 0 or more.
         first_losses: Objectives of the first codes `[object]`, in nats per voxel; None where they
             are not known.
         target_loss: Objective that is low enough to stop, in nats per voxel; None for no such
             target.
-        previous: States of an earlier search in the same space (`Refined.state`): this search goes
-            on from them instead of from `codes`. None starts from `codes`.
+        previous: The outcome of an earlier call with the same arguments, but for `iterations` and
+            `target_loss`: the search goes on as if it had not been interrupted. None begins.
+        warm_start: States of an earlier search in the same space (`Refined.state`), whose targets
+            have changed since: this search starts from them instead of from `codes`. Give other
+            keys, or it draws the same numbers again. None starts from `codes`.
+        callback: `(objects [n], iterations [n], trace [n ...])`, called on the host after each
+            iteration while the compiled loop goes on, by each device for its objects; all are NumPy
+            arrays. `jax.effects_barrier` waits for the last call. None costs nothing.
+        devices: Devices of this process to spread objects over, 1 or more; None for all.
         precision: Precision of the decoder's matrix products during the search, `float32` or
             `bfloat16`; `logits` and `loss` are float32 in any case.
 
     Raises:
-        ValueError: The arguments do not belong to the same number of objects, or `jax.vmap` is
-            asked to search with several networks at once.
+        ValueError: The arguments do not belong to the same number of objects, both `previous` and
+            `warm_start` are given, or `jax.vmap` is asked to search with several networks at once.
     """
-    keys = keys_of(keys, codes, prior)
+    if previous is not None and warm_start is not None:
+        raise ValueError(
+            "Both previous and warm_start are given; give previous to go on with the same targets,"
+            " warm_start to begin anew near an earlier search."
+        )
+    rows = _Rows(
+        keys=keys_of(keys, codes, prior),
+        codes=codes,
+        targets=targets,
+        grids=grids,
+        first_losses=first_losses,
+        begun=None if previous is None else _begun(previous),
+        warm_start=warm_start,
+    )
     space = raw(prior) if space is None else space
-    exact = prepare_one(prior, grids, "float32")
-    searched = exact if precision == "float32" else prepare_one(prior, grids, precision)
-    how = _evaluation(prior, searched, residual, penalty, codes, targets)
 
-    def loss_of(own: PyTree) -> Objective:
-        return lambda point: how.loss(how.shared, space.to_code(point), own)
+    def search(shared, rows):
+        prior, space, weight, target_loss = vary_like(shared, rows.codes)
+        searched = prepare_one(prior, rows.grids, precision)
+        own = Own(searched.own, rows.targets, jnp.full(len(rows.codes), weight, jnp.float32))
+        how = _evaluation(prior, searched, residual, penalty, rows.codes, own)
+        loop = _Loop(refiner, how, space, own, target_loss, callback)
+        states, steps, traces, path = loop.run(rows, iterations)
+        if precision != "float32":
+            exact = prepare_one(prior, rows.grids, "float32")
+            how = how._replace(shared=(exact.shared, how.shared[1]))
+            own = own._replace(features=exact.own)
+        code, logits, loss = _best(how, own, states, space)
+        return Refined(
+            code=code,
+            logits=logits,
+            loss=loss,
+            trace=traces,
+            path=jax.vmap(jax.vmap(space.to_code))(path),
+            iterations=steps,
+            stop=jnp.where(states.stop == StopReason.RUNNING, StopReason.BUDGET, states.stop),
+            state=states,
+        )
 
-    def begin(key, code, own, loss, state):
-        point = space.from_code(code) if state is None else state.best.point
+    return over_devices(search, (prior, space, penalty_weight, target_loss), rows, devices)
+
+
+class _Begun(NamedTuple):
+    """Where an earlier search of each object stood."""
+
+    state: Any
+    trace: Trace
+    iterations: Int[Array, " object"]
+
+
+def _begun(previous: Refined) -> _Begun:
+    """What a search needs to go on. One that had reached its target may be given a lower one."""
+    state, trace = previous.state, jax.tree.map(lambda x: x[:, -1], previous.trace)
+    stop = jnp.where(state.stop == StopReason.TARGET, StopReason.RUNNING, state.stop)
+    return _Begun(state._replace(stop=stop), trace, previous.iterations)
+
+
+class _Rows(NamedTuple):
+    """All that belongs to one object or another, with an axis over objects."""
+
+    keys: Key[Array, " object"]
+    codes: Float[Array, "object d"]
+    targets: PyTree
+    grids: Grids | None
+    first_losses: Float[Array, " object"] | None
+    begun: _Begun | None
+    warm_start: Any
+
+
+class _Loop(NamedTuple):
+    """The loop over iterations, of a batch of objects."""
+
+    refiner: Refiner
+    how: Evaluation
+    space: LatentSpace
+    own: Own
+    target_loss: Float[Array, ""] | float | None
+    callback: Callback | None
+
+    def run(
+        self, rows: _Rows, iterations: int
+    ) -> tuple[Any, Int[Array, " object"], Trace, Float[Array, "object iteration d"]]:
+        """States, iterations of each object, traces, and the best point after each iteration."""
+        first = vary_like(self.first(rows), rows.codes)
+
+        def iterate(now: _Begun, _: Any) -> tuple[_Begun, tuple[Trace, Array]]:
+            running = now.state.stop == StopReason.RUNNING
+            now = lax.cond(jnp.any(running), partial(self.move, rows), lambda now: now, now)
+            return now, (now.trace, now.state.best.point)
+
+        last, shown = lax.scan(iterate, first, length=iterations)
+        over_iterations = partial(jnp.moveaxis, source=0, destination=1)
+        traces, path = jax.tree.map(over_iterations, shown)
+        return last.state, last.iterations, traces, path
+
+    def first(self, rows: _Rows) -> _Begun:
+        """Where the searches begin, or stood."""
+        if rows.begun is not None:
+            begun = rows.begun
+        else:
+            keys = jax.vmap(jax.random.fold_in, (0, None))(rows.keys, 0)
+            started = jax.vmap(self.begin)(
+                keys, rows.codes, self.own, rows.first_losses, rows.warm_start
+            )
+            begun = _Begun(*started, jnp.zeros(len(rows.codes), jnp.int32))
+        return begun._replace(state=_stop_at(self.target_loss, begun.state))
+
+    def begin(self, key: Array, code: Array, own: Own, loss: Any, state: Any) -> tuple[Any, Trace]:
+        """The first state of one object."""
+        point = self.space.from_code(code) if state is None else state.best.point
         if loss is None or state is not None:
-            loss = loss_of(own)(point)
-        if state is None or refiner.resume is None:
-            return refiner.init(key, point, loss)
-        return refiner.resume(key, state, loss)
+            loss = composed(self.how, self.space, own)(point)
+        if state is None or self.refiner.resume is None:
+            return self.refiner.init(key, point, loss)
+        return self.refiner.resume(key, state, loss)
 
-    def move(key, state, own, trace):
-        state, trace = advance(refiner, key, state, trace, loss_of(own))
-        return _stop_at(target_loss, state), trace
+    def move(self, rows: _Rows, now: _Begun) -> _Begun:
+        """One iteration of all objects; those that have stopped stay as they are."""
+        running = now.state.stop == StopReason.RUNNING
 
-    def iterate(carry, number):
-        (states, traces), steps = carry
-        running = states.stop == StopReason.RUNNING
+        def move_one(key, state, own, trace):
+            objective = composed(self.how, self.space, own)
+            state, trace = advance(self.refiner, key, state, trace, objective)
+            return _stop_at(self.target_loss, state), trace
 
-        def move_all():
-            step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
-            return jax.vmap(move)(step_keys, states, own, traces)
-
-        states, traces = lax.cond(jnp.any(running), move_all, lambda: (states, traces))
-        return ((states, traces), steps + running), (traces, states.best.point)
-
-    own = searched.own, targets
-    first_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
-    started = jax.vmap(begin)(first_keys, codes, own, first_losses, previous)
-    started = _stop_at(target_loss, started[0]), started[1]
-    steps = jnp.zeros(len(codes), jnp.int32)
-    ((states, _), steps), (traces, path) = lax.scan(
-        iterate, (started, steps), jnp.arange(iterations)
-    )
-    over_iterations = partial(jnp.moveaxis, source=0, destination=1)
-    final = how._replace(shared=(exact.shared, how.shared[1]))
-    code, logits, loss = _best(final, (exact.own, targets), states, space)
-    return Refined(
-        code=code,
-        logits=logits,
-        loss=loss,
-        trace=jax.tree.map(over_iterations, traces),
-        path=jax.vmap(jax.vmap(space.to_code))(over_iterations(path)),
-        iterations=steps,
-        stop=jnp.where(states.stop == StopReason.RUNNING, StopReason.BUDGET, states.stop),
-        state=states,
-    )
+        iterations = now.iterations + running
+        keys = jax.vmap(jax.random.fold_in)(rows.keys, now.iterations + 1)
+        state, trace = jax.vmap(move_one)(keys, now.state, self.own, now.trace)
+        if self.callback is not None:
+            jax.debug.callback(self.callback, numbers(len(iterations)), iterations, trace)
+        return _Begun(state, trace, iterations)
 
 
-def _evaluation(prior, prepared, residual, penalty, codes, targets) -> Evaluation:
+def _evaluation(prior, prepared, residual, penalty, codes, own) -> Evaluation:
     """The scoring of codes, with the first object of a batch as an example of shapes."""
-    own = pick((prepared.own, targets), 0)
-    return evaluation(prior.model, prepared, residual, penalty, codes[0], own)
+    how = evaluation(prior.model, prepared, residual, penalty, codes[0], pick(own, 0))
+    return how._replace(shared=one_network(how.shared))
 
 
 def _best(
-    how: Evaluation, own: PyTree, states: Any, space: LatentSpace
+    how: Evaluation, own: Own, states: Any, space: LatentSpace
 ) -> tuple[Float[Array, "object d"], Float[Array, "object x y z"], Float[Array, " object"]]:
     """Code, logits and objective of the best that each search has found.
 
@@ -195,13 +303,26 @@ def keys_of(
             f"codes have shape {codes.shape}; give [object, {prior.code_size}], one code for each "
             "object of the batch (code[None] for one object)."
         )
+    return one_key_each(keys, len(codes))
+
+
+def one_key_each(keys: Key[Array, "*object"], count: int) -> Key[Array, " object"]:
+    """One key for each object, from one for each or one for all.
+
+    Args:
+        keys: One key for each object `[object]`, or one for all.
+        count: Number of objects.
+
+    Raises:
+        ValueError: There are neither as many keys as objects nor one.
+    """
     if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
         keys = jax.random.wrap_key_data(keys)
     if keys.ndim == 0:
-        return jax.random.split(keys, len(codes))
-    if keys.shape != (len(codes),):
+        return jax.random.split(keys, count)
+    if keys.shape != (count,):
         raise ValueError(
-            f"There are keys of shape {keys.shape} for {len(codes)} objects; give one for each, "
+            f"There are keys of shape {keys.shape} for {count} objects; give one for each, "
             "jax.random.split(key, objects), or a single one."
         )
     return keys

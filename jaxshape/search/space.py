@@ -56,7 +56,7 @@ class LatentSpace(NamedTuple):
         return point if self.bound is None else jnp.clip(point, -self.bound, self.bound)
 
 
-def whitened(prior: ShapePrior, bound: float | None = None) -> LatentSpace:
+def whitened(prior: ShapePrior, bound: Float[Array, ""] | float | None = None) -> LatentSpace:
     """The space in which the training codes have zero mean and unit covariance.
 
     Args:
@@ -84,7 +84,7 @@ def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     return jnp.where(jnp.all(jnp.isfinite(root)), root, jnp.linalg.cholesky(covariance + room))
 
 
-def raw(prior: ShapePrior, bound: float | None = None) -> LatentSpace:
+def raw(prior: ShapePrior, bound: Float[Array, ""] | float | None = None) -> LatentSpace:
     """The codes themselves, as in the paper.
 
     Args:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.checks import one_of, within
 from jaxshape.search.batching import apply_if
-from jaxshape.search.config import is_array
+from jaxshape.search.config import Number
 from jaxshape.search.refiner import StopReason, finite_or_inf
 
 RECORD_EVERY = 5
@@ -44,19 +44,18 @@ class Tolerances:
         noeffect: Whether to end where a step no longer changes the mean.
 
     Raises:
-        ValueError: A threshold is negative or no number. Arrays of JAX, which may be traced, are
-            not checked.
+        ValueError: A threshold is negative or no number. Those that JAX traces are not checked.
     """
 
-    tolfun: float = 1e-11
-    tolfunhist: float = 1e-12
-    tolx: float = 1e-11
-    tolxstagnation: float = 1e-9
+    tolfun: Number = 1e-11
+    tolfunhist: Number = 1e-12
+    tolx: Number = 1e-11
+    tolxstagnation: Number = 1e-9
     tolstagnation: bool = True
-    tolfacupx: float = 1e3
-    tolupsigma: float = 1e20
-    tolconditioncov: float = 1e14
-    tolflatfitness: float = 1.0
+    tolfacupx: Number = 1e3
+    tolupsigma: Number = 1e20
+    tolconditioncov: Number = 1e14
+    tolflatfitness: Number = 1.0
     noeffect: bool = True
 
     def __post_init__(self) -> None:
@@ -64,7 +63,7 @@ class Tolerances:
             value = getattr(self, field.name)
             if field.type is bool:
                 one_of(field.name, value, (True, False))
-            elif not is_array(value):
+            else:
                 within(field.name, value, 0, math.inf)
 
 
@@ -223,7 +222,7 @@ def _criteria(
     )
 
     def within(spread, tolerance):
-        return (spread < jnp.maximum(tolerance, rounding)) if tolerance else jnp.bool_(False)
+        return (spread < jnp.maximum(tolerance, rounding)) & (tolerance > 0)
 
     stagnates = history.stagnates & (now > dim * (5 + 100 / population))
     since = (now * population - history.improved) / population
@@ -238,7 +237,7 @@ def _criteria(
         StopReason.TOLX: jnp.all(deviations < t.tolx)
         & jnp.all(state.sigma * state.path_c < t.tolx),
         StopReason.TOLXSTAGNATION: (now - history.anchored > _patience(now))
-        & bool(t.tolxstagnation),
+        & (t.tolxstagnation > 0),
         StopReason.TOLSTAGNATION: stagnates & t.tolstagnation,
         StopReason.TOLFACUPX: jnp.any(deviations > t.tolfacupx * sigma0),
         StopReason.TOLUPSIGMA: state.sigma > t.tolupsigma * sigma0 * state.scales[-1],

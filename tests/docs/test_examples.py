@@ -11,7 +11,9 @@ EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
 INSTEAD = {
     "own_decoder.py": {"CHAIRS, STEPS = 48, 600": "CHAIRS, STEPS = 12, 200"},
+    "own_entry.py": {},  # tests/bench runs it
     "own_residual.py": {"1_000_005": "1_000_003", "iterations=60": "iterations=20"},
+    "sweep.py": {", 8), 8": ", 8), 2"},
     "own_search.py": {"1_000_005": "1_000_003", ", 24)": ", 6)", "8 * CALLS": "2 * CALLS"},
 }
 """Of each example, by what runs in its place."""
@@ -80,6 +82,12 @@ def test_outlines_reach_the_search(answer, linear_weights):
 def test_outlines_make_shapes_better(answer):
     alone, outlined = answer("own_residual.py")
     assert outlined > alone
+
+
+@pytest.mark.slow
+def test_a_sweep_finds_settings_that_matter(answer):
+    worst, best, *_ = answer("sweep.py")
+    assert 0 < worst < best <= 1
 
 
 def test_a_search_of_ones_own_searches(answer, linear_weights):

@@ -14,7 +14,9 @@ LONG = ["step_size", "voluminous", "gallery", "gradient_failures", "equal_budget
 @pytest.mark.parametrize(
     "name", [*SCRIPTS, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
 )
-def test_smoke(name, linear_weights, tmp_path):
+def test_smoke(name, linear_weights, tmp_path, request):
+    if name == "step_size":  # traces its settings
+        request.getfixturevalue("unchecked_types")
     script = importlib.import_module(name)
     config = replace(script.Config(), weights=linear_weights, smoke=True, results=tmp_path)
     script.main(config)

@@ -140,7 +140,7 @@ def test_half_an_invitation_to_join_is_refused(given):
 
 
 def test_without_a_cluster_the_processes_must_be_named(monkeypatch):
-    def initialize(*_):
+    def initialize(*_, **__):
         raise ValueError("coordinator_address should be defined.")
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)

@@ -195,16 +195,16 @@ def test_a_bound_holds_every_coordinate(skewed, space):
 def test_the_prior_pulls_codes_to_their_mean(skewed):
     """Its weight counts nats: half the squared Mahalanobis distance, once per grid."""
     code = MEAN + ROOT @ jnp.linspace(-1, 1, 10)
-    penalty = code_penalty(skewed, 2.0)(code)
-    np.testing.assert_allclose(penalty, 2 * 0.5 * mahalanobis(code) / 32**3, rtol=1e-4)
-    assert code_penalty(skewed, 2.0)(MEAN) == 0
+    penalty = code_penalty(skewed)
+    np.testing.assert_allclose(penalty(code), 0.5 * mahalanobis(code) / 32**3, rtol=1e-4)
+    assert penalty(MEAN) == 0
 
     distances = []
     for weight in (0.0, 1e7):
         found = searching(skewed, "gradient", iterations=8, prior_weight=weight, step_size=3e-3)
         distances.append(mahalanobis(found.code))
         if weight:  # the loss of the search is the sum of both
-            total = found.objective + jax.vmap(code_penalty(skewed, weight))(found.code)
+            total = found.objective + weight * jax.vmap(penalty)(found.code)
             assert np.all(total <= found.trace.best_loss[:, -1] * 1.0001)
     assert np.all(distances[0] > 1) and np.all(distances[1] < 1e-3)
 

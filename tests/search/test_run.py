@@ -25,7 +25,7 @@ TARGETS = weigh(
     jnp.tensordot(CODES, PARAMS, 1),
     LESS_FREE,
 )
-METHODS = ["cma", "gradient", "gradient:lbfgs", "evosax:SNES", "hybrid:adam"]  # and `hybrid` below
+METHODS = ["cma", "gradient", "gradient:lbfgs", "evosax:SNES", "hybrid:adam", "gauss-newton"]
 
 
 def searching(prior, method, iterations=ITERATIONS, config=CONFIG, **options):
@@ -103,6 +103,8 @@ def test_the_trace_never_rises_and_counts_what_was_decoded(method, refined, coun
     counted = trace.evaluations[:, -1].sum()
     if method == "gradient:lbfgs":  # in a batch, line searches wait for the longest
         assert counted <= counts[method]
+    elif method == "gauss-newton":  # every model takes a decoded code, and D products
+        assert counted - counts[method] == D / (1 + D) * (counted - OBJECTS * ITERATIONS)
     else:
         assert counted == counts[method]
 
@@ -144,6 +146,17 @@ def test_an_object_alone_finds_what_it_finds_in_company(search, refined):
     np.testing.assert_allclose(alone.loss[0], refined.loss[1], rtol=1e-4)
 
 
+def test_a_search_that_was_interrupted_goes_on_as_if_it_had_not_been(method, refined, counted):
+    half = searching(counted, method, ITERATIONS // 2)
+    first = half(KEYS, CODES, TARGETS)
+    found = half(KEYS, CODES, TARGETS, previous=first)
+    for name in ("code", "loss", "iterations", "stop", "state"):
+        both = getattr(found, name), getattr(refined, name)
+        jax.tree.map(np.testing.assert_array_equal, *both)
+    halves = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), first[3:5], found[3:5])
+    jax.tree.map(np.testing.assert_array_equal, halves, refined[3:5])  # trace and path
+
+
 # --- objects that are done ----------------------------------------------------------------------
 
 LONG = 60
@@ -156,10 +169,8 @@ def to_goal(counted):
     """A search until its loss is that of the last argument."""
     refiner = build_refiner("cma", D, CONFIG)
 
-    def search(codes, targets, goal, previous=None):
-        return refine(
-            KEYS, counted, codes, targets, refiner, LONG, target_loss=goal, previous=previous
-        )
+    def search(codes, targets, goal, **options):
+        return refine(KEYS, counted, codes, targets, refiner, LONG, target_loss=goal, **options)
 
     return jax.jit(search)
 
@@ -229,7 +240,7 @@ CHANGED = jax.tree.map(lambda x: x * (1 + 0.1 * jax.random.normal(KEYS[0], x.sha
 
 def test_a_warm_start_keeps_the_distribution_and_scores_it_anew(to_goal, endless):
     before = endless.state
-    found = to_goal(CODES, CHANGED, jnp.inf, previous=before)  # content with the start
+    found = to_goal(CODES, CHANGED, jnp.inf, warm_start=before)  # content with the start
     np.testing.assert_array_equal(found.iterations, 0)
     for name in ("mean", "sigma", "covariance"):
         np.testing.assert_array_equal(getattr(found.state, name), getattr(before, name))
@@ -243,7 +254,7 @@ def test_a_warm_start_keeps_the_distribution_and_scores_it_anew(to_goal, endless
 def test_after_a_small_change_a_warm_start_needs_fewer_iterations(to_goal, endless):
     goal = to_goal(SAME_CODES, CHANGED, -jnp.inf).loss.max() + 1e-3
     cold = to_goal(SAME_CODES, CHANGED, goal)
-    warm = to_goal(SAME_CODES, CHANGED, goal, previous=endless.state)
+    warm = to_goal(SAME_CODES, CHANGED, goal, warm_start=endless.state)
     np.testing.assert_array_equal(cold.stop, StopReason.TARGET)
     np.testing.assert_array_equal(warm.stop, StopReason.TARGET)
     assert np.all(2 * warm.iterations < cold.iterations)
@@ -253,10 +264,41 @@ def test_searches_without_a_resume_begin_again_at_the_best_point(endless, counte
     """The losses of the first codes say nothing of where the search begins now."""
     best, known = endless.state.best.point, jnp.zeros(OBJECTS)
     again = searching(counted, "evosax:SNES", 1)
-    found = again(KEYS, CODES, CHANGED, first_losses=known, previous=endless.state)
+    found = again(KEYS, CODES, CHANGED, first_losses=known, warm_start=endless.state)
     np.testing.assert_array_equal(found.state.origin, best)
     for i in range(OBJECTS):
         assert 0 < found.state.best.loss[i] <= loss_of(best[i], i, CHANGED) * (1 + 1e-5)
+
+
+def test_a_search_at_its_target_goes_on_to_a_lower_one(to_goal, endless):
+    first, second = (float(endless.trace.best_loss[:, i].max()) for i in (8, 20))
+    near = to_goal(SAME_CODES, SAME_TARGETS, first)
+    found = to_goal(SAME_CODES, SAME_TARGETS, second, previous=near)
+    unbroken = to_goal(SAME_CODES, SAME_TARGETS, second)
+    assert np.all(near.iterations <= unbroken.iterations) and np.any(near.iterations < LONG)
+    np.testing.assert_array_equal(found.iterations, unbroken.iterations)
+    np.testing.assert_array_equal(found.code, unbroken.code)
+
+
+def test_going_on_and_beginning_anew_exclude_each_other(counted, endless):
+    with pytest.raises(ValueError, match="Both previous and warm_start are given; give previous"):
+        searching(counted, "cma")(KEYS, CODES, TARGETS, previous=endless, warm_start=endless.state)
+
+
+def test_a_callback_hears_of_every_iteration(to_goal, endless):
+    heard = []
+    goal = float(endless.trace.best_loss[:, 12].max())
+    found = to_goal(
+        SAME_CODES, SAME_TARGETS, goal, callback=jax.tree_util.Partial(lambda *x: heard.append(x))
+    )
+    jax.effects_barrier()
+    assert len(heard) == found.iterations.max()
+    for objects, iterations, trace in heard:
+        np.testing.assert_array_equal(objects, range(OBJECTS))
+        for i in range(OBJECTS):
+            expected = found.trace.best_loss[i, iterations[i] - 1]
+            np.testing.assert_array_equal(trace.best_loss[i], expected)
+    np.testing.assert_array_equal(heard[-1][1], found.iterations)
 
 
 # --- spaces and penalties -----------------------------------------------------------------------

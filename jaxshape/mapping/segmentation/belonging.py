@@ -186,9 +186,9 @@ def _parts(index: int, seen: Seen, box: Box, reach: Box, column: Box) -> list[_P
     for label in np.unique(seen.labels[within[1] & (seen.labels > 0)]):
         pixels = seen.labels == label
         points = seen.points[pixels]
-        shares = [float(inside[pixels].mean()) for inside in within]
+        in_box, in_reach, in_column = (float(inside[pixels].mean()) for inside in within)
         some, is_corner = points[:: 1 + len(points) // _SAMPLE], bool(label in seen.corners)
-        found.append(_Part(index, int(label), some, *shares, is_corner))
+        found.append(_Part(index, int(label), some, in_box, in_reach, in_column, is_corner))
     return found
 
 

@@ -242,7 +242,7 @@ def corners(labels: Int[np.ndarray, "h w"], view: Scene) -> list[int]:
     found = []
     for label in at_border[at_border > 0].tolist():
         piece = labels == label
-        beside = binary_dilation(piece, iterations=BESIDE) & (labels > 0)
+        beside = np.asarray(binary_dilation(piece, iterations=BESIDE), bool) & (labels > 0)
         beside[beside] = sizes[labels[beside]] > LARGER * sizes[label]
         if beside.any():
             z, behind = np.median(view.z[piece]), np.median(view.z[beside], keepdims=True)

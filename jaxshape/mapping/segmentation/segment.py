@@ -139,8 +139,8 @@ def segment(
     is_told = clicked or prompt.number is not None
     doubts = [doubt, *doubts_of(segmented, behind, view, clicked=is_told)]
     core = segmented & ~np.isin(labels, chosen[1:])
-    at_full_size = [enlarged(pixels, view, depth) & allowed for pixels in (segmented, core)]
-    return Segmentation(*at_full_size, *judged(doubts, len(chosen)))
+    whole, certain = (enlarged(pixels, view, depth) & allowed for pixels in (segmented, core))
+    return Segmentation(whole, certain, *judged(doubts, len(chosen)))
 
 
 def check_prompt(prompt: Prompt, shape: tuple[int, ...]) -> None:

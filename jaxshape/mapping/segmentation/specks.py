@@ -7,6 +7,7 @@ frames show in the same place, and what is connected there with the object, belo
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
+from skimage.measure import label
 
 from jaxshape.data.boxes import Box
 
@@ -39,7 +40,7 @@ def confirmed(
         shown += _grown(mine | loose)
     body, loose = np.any(ours_in, axis=0), np.any(specks_in, axis=0) & (shown >= CONFIRMED)
     # Neighbours of neighbours are connected: thin parts have gaps.
-    labels, _ = ndimage.label(_grown(body | loose), np.ones((3, 3, 3)))
+    labels = np.asarray(label(_grown(body | loose), connectivity=3))
     connected = loose & np.isin(labels, np.unique(labels[body]))
     return [connected[tuple(_cells(points, reach, shape).T)] for points in specks]
 

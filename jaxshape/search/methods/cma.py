@@ -35,7 +35,7 @@ def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
 def cma(
     *,
     dim: int,
-    sigma0: float,
+    sigma0: Float[Array, ""] | float,
     population: int | None = None,
     tolerances: Tolerances = Tolerances(),
 ) -> Refiner:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape.checks import positive, whole
 from jaxshape.search.batching import cast_like
-from jaxshape.search.config import RefineConfig, is_array
+from jaxshape.search.config import RefineConfig
 from jaxshape.search.refiner import (
     Candidate,
     Objective,
@@ -88,7 +88,12 @@ def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
 
 
 def evosax_strategy(
-    name: str, *, dim: int, population: int, sigma0: float, **settings: Any
+    name: str,
+    *,
+    dim: int,
+    population: int,
+    sigma0: Float[Array, ""] | float,
+    **settings: Any,
 ) -> Refiner:
     """An evosax strategy by name: "Sep_CMA_ES", "SNES", "Open_ES" and their like.
 
@@ -113,8 +118,7 @@ def evosax_strategy(
     """
     whole("dim", dim, 1)
     whole("population", population, 1)
-    if not is_array(sigma0):
-        positive("sigma0", sigma0)
+    positive("sigma0", sigma0)
     strategy = _build(name, dim, population, settings)
     params = strategy.default_params
     populations = getattr(strategy, "num_populations", None)

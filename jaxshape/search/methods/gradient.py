@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape.checks import at_least, positive, whole
 from jaxshape.search.batching import cast_like, select
-from jaxshape.search.config import RefineConfig, is_array
+from jaxshape.search.config import RefineConfig
 from jaxshape.search.refiner import (
     Candidate,
     Objective,
@@ -146,7 +146,10 @@ def _optimizer(name: str, config: RefineConfig) -> optax.GradientTransformation:
 
 
 def gradient(
-    optimizer: optax.GradientTransformation | float, *, tolerance: float = 0.0, patience: int = 10
+    optimizer: optax.GradientTransformation | Float[Array, ""] | float,
+    *,
+    tolerance: Float[Array, ""] | float = 0.0,
+    patience: int = 10,
 ) -> Refiner:
     """Descend the gradient of the objective.
 
@@ -169,12 +172,10 @@ def gradient(
     Raises:
         ValueError: A setting is outside its range.
     """
-    if not is_array(tolerance):
-        at_least("tolerance", tolerance, 0)
+    at_least("tolerance", tolerance, 0)
     whole("patience", patience, 1)
     if not isinstance(optimizer, optax.GradientTransformation):
-        if not is_array(optimizer):
-            positive("step_size", optimizer)
+        positive("step_size", optimizer)
         optimizer = optax.sgd(optimizer)
     transformation = optax.with_extra_args_support(optimizer)
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxshape.checks import whole
 from jaxshape.search.batching import select
 from jaxshape.search.config import RefineConfig
+from jaxshape.search.curvature import only_where
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.refiner import Candidate, Objective, Refiner, StopReason, Trace
 
@@ -80,14 +81,13 @@ def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
     def step(key: Array, state: HybridState, objective: Objective) -> tuple[HybridState, Trace]:
         # A batch has objects in both searches, so both take their step; but the one that rests
         # asks for points that are not finite, which are not decoded.
-        def only(wanted: Bool[Array, ""]) -> Objective:
-            return lambda point: objective(jnp.where(wanted, point, jnp.nan))
-
         search_key, polish_key, begin_key = jax.random.split(key, 3)
         polishing = state.polishing
-        stepped = search.step(search_key, state.searched[0], only(~polishing))
+        stepped = search.step(search_key, state.searched[0], only_where(~polishing, objective))
         searched, trace = select(polishing, state.searched, stepped)
-        polished, polish_trace = polish.step(polish_key, state.polished, only(polishing))
+        polished, polish_trace = polish.step(
+            polish_key, state.polished, only_where(polishing, objective)
+        )
         polish_trace = polish_trace._replace(
             evaluations=trace.evaluations + polish_trace.evaluations - 1,
             distribution=trace.distribution,

@@ -24,6 +24,7 @@ METHODS = [
     "evosax:EvoTF_ES",
     "evosax:Open_ES",
     "hybrid",
+    "gauss-newton",
 ]
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")

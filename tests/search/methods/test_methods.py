@@ -44,11 +44,16 @@ def test_every_name_gives_a_search_that_lowers_the_loss(name):
 @pytest.mark.parametrize(
     "name, message",
     [
-        ("sgd", "no method 'sgd'; choose from cma, evosax, gradient, hybrid, or 'encoder'"),
+        (
+            "sgd",
+            "no method 'sgd'; choose from cma, evosax, gauss-newton, gradient, hybrid, or 'enc",
+        ),
         ("", "no method ''; choose from"),
         ("cma:nbipop", "choose cma, cma:ipop or cma:bipop"),
         ("gradient:adamm", "no optimiser 'adamm'"),
         ("hybrid:adamm", "no optimiser 'adamm'"),
+        ("gauss-newton:all", "no method 'gauss-newton:all'; give a number .* gauss-newton:3"),
+        ("gauss-newton:0", "directions is 0; give a whole number, 1 or more"),
         ("evosax", "choose one of .*SNES"),
         ("evosax:Nelder", "no evosax strategy 'Nelder'; choose one of .*SNES"),
         ("methods.cma", "no method 'methods.cma'"),
@@ -108,7 +113,7 @@ def test_an_entry_point_goes_by_its_name_like_a_family(package):
     (installed / "entry_points.txt").write_text(
         "[jaxshape.methods]\ntheirs = their_package.searches:build\n"
     )
-    assert families() == ["cma", "evosax", "gradient", "hybrid", "theirs"]
+    assert families() == ["cma", "evosax", "gauss-newton", "gradient", "hybrid", "theirs"]
     for name, left in {"theirs": 0.5, "theirs:short": 0.9}.items():
         refiner = build_refiner(name, 3, CONFIG)
         state, _ = refiner.init(KEY, POINTS[0], sphere(POINTS[0]))

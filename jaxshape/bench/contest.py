@@ -1,0 +1,225 @@
+"""A method on a batch of problems, until the budget of each is spent. [host]"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxshape.bench.ask_tell import ASK_TELL, AskTell
+from jaxshape.bench.problems import Problem, objectives, stacked_targets
+from jaxshape.bench.watching import Observer, WatchedObjective, evaluates_in_a_branch, watched
+from jaxshape.data.dataset import hash_seed
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.names import find_build
+from jaxshape.search.reconstruction import search_space
+from jaxshape.search.refiner import Refiner, StopReason, advance
+from jaxshape.search.residuals import Target
+from jaxshape.search.space import LatentSpace
+
+
+class Outcome(NamedTuple):
+    """What became of problems that were searched together.
+
+    Attributes:
+        observer: What was evaluated of them.
+        stops: By problem, why its search stopped: the name of a `StopReason`, or what the search
+            itself said.
+        compiling: Time that compiling took, in seconds; next to none but for the first problems.
+    """
+
+    observer: Observer
+    stops: list[str]
+    compiling: float
+
+
+Contestant = Callable[[Sequence[Problem], int], Outcome]
+"""`(problems, seed) -> outcome`, compiled once for each number of problems."""
+
+
+def contestant(
+    method: str, prior: ShapePrior, config: RefineConfig, budget: int
+) -> tuple[Contestant, bool]:
+    """A search by its name, ready to be run on problems.
+
+    Args:
+        method: Name of a search (`jaxshape.search.names`), `pycma`, or `nevergrad:NAME`.
+        prior: The shape prior of the problems.
+        config: Settings of the search.
+        budget: Decoder calls that each problem may spend.
+
+    Returns:
+        The contestant, and whether it must be given one problem at a time: a search that evaluates
+        within a loop of its own.
+
+    Raises:
+        ValueError: There is no such search, or it refuses its settings.
+    """
+    field = _Field(prior, search_space(prior, config), Observer(budget))
+    family, _, variant = method.partition(":")
+    if family in ASK_TELL:
+        build, found = ASK_TELL[family], variant or None
+    else:
+        build, found = find_build(method)
+    search = build(found, prior.code_size, config)
+    if isinstance(search, AskTell):
+        return _on_the_host(search, field), False
+    if not isinstance(search, Refiner):
+        raise ValueError(
+            f"The method {method!r} returned {type(search).__name__}; it must return a"
+            " jaxshape.Refiner or a jaxshape.AskTell."
+        )
+    return _compiled(search, field), _must_be_alone(search, prior.code_size)
+
+
+def _must_be_alone(refiner: Refiner, dim: int) -> bool:
+    """Whether a step of the search evaluates within a loop or a branch, as line searches do."""
+    loss = watched(lambda owner: lambda code: jnp.sum(code**2), Observer(1))
+    key, owner, point = jax.random.key(0), jnp.int32(0), jnp.zeros(dim)
+    state, _ = refiner.init(key, point, jnp.float32(1))
+    step = lambda key, state: refiner.step(key, state, lambda code: loss(code, owner))  # noqa: E731
+    return evaluates_in_a_branch(step, key, state)
+
+
+# ------------------------------------------------------------------ problems side by side
+
+
+class _Field(NamedTuple):
+    """Where a method is run.
+
+    Attributes:
+        prior: The shape prior of the problems.
+        space: Coordinates of the search.
+        observer: Counts what is evaluated.
+    """
+
+    prior: ShapePrior
+    space: LatentSpace
+    observer: Observer
+
+    def loss(self, decoder: ShapePrior, targets: Target) -> WatchedObjective:
+        """The watched objective `loss(point, number of the problem)`."""
+        of_code = watched(objectives(decoder, targets), self.observer)
+        return lambda point, owner: of_code(self.space.to_code(point), owner)
+
+    def start(self, problems: Sequence[Problem], seed: int) -> "_Start":
+        """Stack the arrays of problems."""
+        codes = jnp.stack([one.first_code for one in problems])
+        return _Start(
+            decoder=problems[0].decoder,
+            targets=stacked_targets(problems),
+            codes=codes,
+            points=jax.vmap(self.space.from_code)(codes),
+            losses=jnp.array([one.first_objective for one in problems], jnp.float32),
+            seeds=[hash_seed(seed, *one.name.encode()) for one in problems],
+        )
+
+
+class _Start(NamedTuple):
+    """Where the searches of some problems start.
+
+    Attributes:
+        decoder: The shape prior, its parameters prepared.
+        targets: Targets of the problems `[problem ...]`.
+        codes: First codes `[problem d]`.
+        points: The same in the search space `[problem d]`.
+        losses: Objectives of the first codes `[problem]`.
+        seeds: A seed for each problem, whatever its company.
+    """
+
+    decoder: ShapePrior
+    targets: Target
+    codes: Float[Array, "problem d"]
+    points: Float[Array, "problem d"]
+    losses: Float[Array, " problem"]
+    seeds: list[int]
+
+
+def _compiled(refiner: Refiner, field: _Field) -> Contestant:
+    """A `Refiner`: all problems take their step in one call of a compiled program."""
+    observer, programs = field.observer, {}
+
+    @jax.jit
+    @jax.vmap
+    def begin(key, point, loss):
+        return refiner.init(jax.random.fold_in(key, 0), point, loss)
+
+    def move(decoder, targets, number, spent, key, owner, state, trace):
+        loss = field.loss(decoder, targets)
+        stop = jnp.where((state.stop == 0) & spent, StopReason.BUDGET, state.stop)
+        state, key = state._replace(stop=stop), jax.random.fold_in(key, number)
+        return advance(refiner, key, state, trace, lambda point: loss(point, owner))
+
+    move_all = jax.jit(jax.vmap(move, (None, None, None, 0, 0, 0, 0, 0)))
+
+    def search(problems, seed):
+        at, began = field.start(problems, seed), time.perf_counter()
+        keys = jax.vmap(jax.random.key)(jnp.array(at.seeds, jnp.uint32))
+        owners, spent = jnp.arange(len(problems)), np.zeros(len(problems), bool)
+        now = begin(keys, at.points, at.losses)
+        if len(problems) not in programs:
+            shapes = at.decoder, at.targets, jnp.int32(1), jnp.asarray(spent), keys, owners, *now
+            programs[len(problems)] = move_all.lower(*shapes).compile()
+        step, compiling = programs[len(problems)], time.perf_counter() - began
+        observer.begin(at.codes, at.losses)
+        for number in range(1, observer.budget + 2):  # a search that evaluates nothing ends too
+            more = jnp.int32(number), jnp.asarray(spent), keys, owners
+            now = step(at.decoder, at.targets, *more, *now)
+            jax.effects_barrier()
+            spent = observer.spent
+            stops = np.where(spent & (now[0].stop == 0), StopReason.BUDGET, now[0].stop)
+            if StopReason.RUNNING not in stops:
+                break
+        named = [StopReason(int(stop) or StopReason.BUDGET).name.lower() for stop in stops]
+        return Outcome(observer, named, compiling)
+
+    return search
+
+
+def _on_the_host(search: AskTell, field: _Field) -> Contestant:
+    """An `AskTell`: one search for each problem, all their points evaluated in one call."""
+    observer = field.observer
+
+    @jax.jit
+    def evaluate(decoder, targets, points):
+        loss = field.loss(decoder, targets)
+        return jax.vmap(jax.vmap(loss, (0, None)))(points, jnp.arange(len(points)))
+
+    def run(problems, seed):
+        at = field.start(problems, seed)
+        starts = zip(at.seeds, np.asarray(at.points, np.float64), at.losses.tolist(), strict=True)
+        searches = [search.start(*one) for one in starts]
+        stops: list[str | None] = [None] * len(searches)
+        asked, began = [one.ask() for one in searches], time.perf_counter()
+        nothing = np.nan * _stacked(asked, stops)
+        observer.begin(at.codes, at.losses)
+        jax.block_until_ready(evaluate(at.decoder, at.targets, nothing))
+        compiling = time.perf_counter() - began
+        observer.begin(at.codes, at.losses)
+        while None in stops:
+            losses = np.asarray(evaluate(at.decoder, at.targets, _stacked(asked, stops)))
+            jax.effects_barrier()
+            for i, one in enumerate(searches):
+                if stops[i] is None:
+                    said = one.tell(asked[i], losses[i, : len(asked[i])])
+                    stops[i] = said or ("budget" if observer.spent[i] else None)
+                if stops[i] is None:
+                    asked[i] = one.ask()
+        return Outcome(observer, list(map(str, stops)), compiling)
+
+    return run
+
+
+def _stacked(
+    asked: Sequence[Float[np.ndarray, "n d"]], stops: Sequence[str | None]
+) -> Float[np.ndarray, "problem m d"]:
+    """The points of all searches; NaN beside them, and for those that have stopped."""
+    points = np.full((len(asked), max(map(len, asked)), asked[0].shape[1]), np.nan, np.float32)
+    for i, (one, stop) in enumerate(zip(asked, stops, strict=True)):
+        if stop is None:
+            points[i, : len(one)] = one
+    return points

@@ -1,0 +1,220 @@
+"""An entry: the file that holds the results of one method, and what makes it valid. [host]
+
+    {"format", "set", "sha256", "name", "method", "settings", "budget", "seed",   what was run
+     "machines": {key: ...},                                                       where
+     "rows": {problem: ...}}                                                       with what result
+
+A row is what `scoring` keeps, with the machine and how busy that was, how many problems were
+searched `together`, and the seconds that `compiling` took.
+"""
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxshape.bench.config import LADDER, LEFT
+from jaxshape.bench.machine import describe_machine, load
+from jaxshape.bench.problem_set import NAME, SHA256
+from jaxshape.bench.problems import Problem
+from jaxshape.bench.scoring import Row, targets, unpacked_code
+from jaxshape.files import write_text
+
+FORMAT = "jaxshape-bench-entry-1"
+
+PACKAGES = ("jaxshape", "jax", "jaxlib", "numpy", "optax", "evosax", "cma", "nevergrad")
+
+CLOSE = 1e-4
+"""Share by which an objective may differ from machine to machine."""
+
+
+class Entry(NamedTuple):
+    """The results of one method, or a part of them.
+
+    Attributes:
+        about: What was run: `format`, `set` and `sha256` of the problem set, `name`, `method`,
+            `settings`, `budget` in decoder calls, `seed`.
+        machines: The machines that rows name, by a key.
+        rows: Results by problem.
+    """
+
+    about: dict[str, Any]
+    machines: dict[str, dict[str, Any]]
+    rows: dict[str, Row]
+
+
+def new_entry(
+    name: str,
+    *,
+    method: str | None = None,
+    settings: dict[str, Any] | None = None,
+    budget: int = LADDER[-1],
+    seed: int = 0,
+) -> Entry:
+    """An entry without any rows.
+
+    Args:
+        name: Name of the method on the board.
+        method: Name by which the search can be built; None for a loop of your own.
+        settings: What a reader needs to repeat the search, as JSON can hold it.
+        budget: Decoder calls that each problem could spend.
+        seed: Seed of the searches.
+    """
+    about = {
+        "format": FORMAT,
+        "set": NAME,
+        "sha256": SHA256,
+        "name": name,
+        "method": method,
+        "settings": settings or {},
+        "budget": budget,
+        "seed": seed,
+    }
+    return Entry(json.loads(json.dumps(about)), {}, {})
+
+
+def with_rows(entry: Entry, rows: dict[str, Row]) -> Entry:
+    """The entry with rows that this machine has just made.
+
+    Args:
+        entry: The entry so far.
+        rows: Results of problems that were searched together.
+    """
+    here = describe_machine(PACKAGES)
+    key = hashlib.sha256(json.dumps(here, sort_keys=True).encode()).hexdigest()[:8]
+    more = {name: row | {"machine": key, "load": load()} for name, row in rows.items()}
+    return entry._replace(machines=entry.machines | {key: here}, rows=entry.rows | more)
+
+
+def write_entry(path: Path, entry: Entry) -> None:
+    """Write an entry, with a line for each problem.
+
+    Args:
+        path: The file, `.json`.
+        entry: The entry.
+    """
+    head = json.dumps(entry.about | {"machines": entry.machines}, indent=1)[:-2]
+    rows = ",\n".join(f"  {json.dumps(k)}: {json.dumps(v)}" for k, v in entry.rows.items())
+    write_text(path, f'{head},\n "rows": {{\n{rows}\n }}\n}}\n')
+
+
+def read_entry(path: Path) -> Entry:
+    """Read an entry.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ValueError: The file is no entry.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        machines, rows = content.pop("machines"), content.pop("rows")
+        is_entry = content["format"] == FORMAT and isinstance(content["name"], str)
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
+        is_entry = False
+    if not is_entry:
+        raise ValueError(f"{str(path)!r} is no entry of the benchmark ({FORMAT}).")
+    return Entry(content, machines, rows)
+
+
+def read_entries(paths: Iterable[Path]) -> list[Entry]:
+    """Read entries, and merge the parts of each; those of a name must agree in all but rows.
+
+    Args:
+        paths: The files.
+
+    Raises:
+        ValueError: A file is no entry, or two of one name differ in what was run.
+    """
+    found: dict[str, Entry] = {}
+    for path in sorted(paths):
+        entry = read_entry(path)
+        before = found.get(entry.about["name"], entry)
+        if before.about != entry.about:
+            differ = [key for key, value in entry.about.items() if before.about.get(key) != value]
+            raise ValueError(
+                f"{str(path)!r} and another file have results of {entry.about['name']!r}, but"
+                f" differ in {', '.join(differ)}; keep them in different folders."
+            )
+        found[entry.about["name"]] = Entry(
+            entry.about, before.machines | entry.machines, entry.rows | before.rows
+        )
+    return list(found.values())
+
+
+def file_name(name: str, part: str = "") -> str:
+    """The name of the file of an entry, or of its part `i/n`."""
+    stem = re.sub(r"[^A-Za-z0-9@=.]+", "_", name).strip("_.") or "entry"
+    return f"{stem}{'.part-' + part.replace('/', '-of-') if part else ''}.json"
+
+
+# ------------------------------------------------------------------ what makes it valid
+
+
+def faults(entry: Entry, problems: Sequence[Problem]) -> list[str]:
+    """What is wrong with an entry, in sentences; none of a valid one.
+
+    Objectives and overlaps are computed again from the codes that the entry holds.
+
+    Args:
+        entry: The entry.
+        problems: The problems of the set.
+    """
+    about = entry.about
+    if (about["set"], about["sha256"]) != (NAME, SHA256):
+        return [f"It was made on {about['set']} ({about['sha256'][:8]}), another set of problems."]
+    if not (isinstance(about["budget"], int) and 1 <= about["budget"] <= LADDER[-1]):
+        return [
+            f"Its budget is {about['budget']!r}; 1 to {LADDER[-1]} decoder calls can be compared."
+        ]
+    known = {one.name: one for one in problems}
+    found = [f"There is no problem {name!r}." for name in entry.rows if name not in known]
+    for name, row in entry.rows.items():
+        if name in known:
+            try:
+                fault = _fault(row, known[name], about["budget"])
+            except (KeyError, TypeError, ValueError, IndexError) as problem:
+                fault = f"a figure is missing or of another form ({problem})"
+            found += [f"{name}: {fault}."] if fault else []
+    return found
+
+
+def _fault(row: Row, problem: Problem, budget: int) -> str | None:
+    """What is wrong with a row."""
+    objective, ious, reached = (
+        np.array(row[key], float) for key in ("objective", "iou", "reached")
+    )
+    goals = np.array(targets(problem))
+    if objective.shape != (len(LADDER),) or ious.shape != (len(LADDER),):
+        return f"objectives and IoU are not given at the {len(LADDER)} numbers of decoder calls"
+    if not (np.isfinite(objective).all() and np.diff(objective).max() <= 0):
+        return "the objective of the best code so far rises"
+    if not _close(objective[0], float(problem.first_objective)):
+        return "it does not start from the first code"
+    if not 0 <= row["calls"] < budget + LADDER[3]:
+        return f"it spent {row['calls']} decoder calls of {budget}"
+    calls = reached[:, 0]
+    if len(calls) > len(LEFT) or np.diff(reached, axis=0).min(initial=0) < 0:
+        return "targets are reached in another order than that of their difficulty"
+    if calls.max(initial=0) > budget:
+        return "a target is reached after the budget was spent"
+    at_rungs = np.array([sum(calls <= rung) for rung in LADDER])
+    fewest, most = ((objective[:, None] <= goals * (1 + s * CLOSE)).sum(1) for s in (-1, 1))
+    if (at_rungs < fewest).any() or (at_rungs > most).any():
+        return "targets are reached where the objective says otherwise"
+    code = unpacked_code(row["code"])
+    if not _close(float(problem.objective(code)), objective[-1]):
+        return f"its last code has another objective than {objective[-1]:g}"
+    if abs(float(problem.iou(code)) - ious[-1]) > 0.01:
+        return f"its last code has another IoU than {ious[-1]:g}"
+    return None
+
+
+def _close(a: float, b: float) -> bool:
+    return math.isclose(a, b, rel_tol=CLOSE)

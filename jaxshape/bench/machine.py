@@ -1,0 +1,48 @@
+"""The machine that results were made on, as a reader needs it to compare figures. [host]"""
+
+import os
+import platform
+from collections.abc import Iterable
+from importlib import metadata
+from typing import Any
+
+import jax
+
+from jaxshape.process import processor
+
+
+def describe_machine(packages: Iterable[str]) -> dict[str, Any]:
+    """Processor, device and versions.
+
+    Args:
+        packages: Names of the packages whose versions count; None stands for one that is missing.
+    """
+    model, features = processor()
+    return {
+        "processor": model,
+        "cores": _cores(),
+        "features": [f for f in ("avx2", "avx512f", "avx512_bf16", "amx_bf16") if f in features],
+        "device": jax.devices()[0].device_kind if jax.default_backend() != "cpu" else "cpu",
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in packages},
+    }
+
+
+def load() -> float | None:
+    """Processes that wanted to run during the last minute, over the cores; None if not known."""
+    return round(os.getloadavg()[0] / _cores(), 2) if hasattr(os, "getloadavg") else None
+
+
+def _cores() -> int:
+    """Those this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,99 @@
+"""The frozen problems: what was measured of chairs and seats, and their true surfaces. [host]
+
+A set is two files of one name: the grids (`.npz`, packed as in a dataset), and what belongs to them
+(`.json`): the objects with their makers, the weights whose codes are searched, and the lowest
+objective known of each problem. experiments/bench_set.py made both. A set never changes; another
+one gets another name.
+"""
+
+import hashlib
+import json
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxshape.bench.config import FRAMES, KINDS
+from jaxshape.files import atomic_path, write_json
+
+NAME = "jaxshape-bench-1"
+SHA256 = "3e51b57120826df6eca017f1be39cd830519a69e3e4ae0d22ee2529f7a5ae07b"
+"""Hash of the packaged set, which every entry names (`fingerprint`)."""
+
+
+class ProblemSet(NamedTuple):
+    """What was measured of some objects after some numbers of frames.
+
+    Attributes:
+        name: Name of the set, with its version.
+        objects: Of each object its name, and where it comes from.
+        measured: By kind, F and M of each object and number of frames `[object number voxels]`, as
+            `pack_measured` packs them.
+        surfaces: True surface voxels of each object `[object bytes]`, as `pack` packs them.
+        weights: Fingerprint of the weights whose codes are searched.
+        best: By problem, the lowest objective known, in nats per voxel.
+    """
+
+    name: str
+    objects: list[dict[str, Any]]
+    measured: dict[str, UInt8[np.ndarray, "object number voxels"]]
+    surfaces: UInt8[np.ndarray, "object bytes"]
+    weights: str
+    best: dict[str, float]
+
+    def keys(self) -> list[tuple[str, int, int, str]]:
+        """Name, object, place among the numbers of frames, and kind of every problem."""
+        every = product(range(len(self.objects)), enumerate(FRAMES), KINDS)
+        return [
+            (f"{self.objects[o]['name']}/{k}/{kind}", o, place, kind)
+            for o, (place, k), kind in every
+        ]
+
+
+def packaged_set() -> ProblemSet:
+    """The set that comes with the package."""
+    return read_set(Path(__file__).with_name(NAME))
+
+
+def read_set(stem: Path) -> ProblemSet:
+    """Read a set of problems.
+
+    Args:
+        stem: Path of its files without their suffixes.
+    """
+    about = json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))
+    with np.load(stem.with_suffix(".npz")) as arrays:
+        measured, surfaces = {kind: arrays[kind] for kind in KINDS}, arrays["surface"]
+    return ProblemSet(
+        stem.name, about["objects"], measured, surfaces, about["weights"], about["best"]
+    )
+
+
+def write_set(folder: Path, found: ProblemSet) -> None:
+    """Write both files of a set; the same set gives the same bytes.
+
+    Args:
+        folder: Folder to write into.
+        found: The set.
+    """
+    with atomic_path(folder / f"{found.name}.npz") as path:
+        arrays: dict[str, Any] = {"surface": found.surfaces, **found.measured}
+        np.savez_compressed(path, **arrays)
+    about = {"weights": found.weights, "objects": found.objects, "best": found.best}
+    write_json(folder / f"{found.name}.json", about)
+
+
+def fingerprint(found: ProblemSet) -> str:
+    """A hash of all that a set holds, whatever its files were compressed by.
+
+    Args:
+        found: The set.
+    """
+    arrays = [found.surfaces, *(found.measured[kind] for kind in KINDS)]
+    about = json.dumps([found.name, found.weights, found.objects, found.best], sort_keys=True)
+    digest = hashlib.sha256(about.encode())
+    for array in arrays:
+        digest.update(f"{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()

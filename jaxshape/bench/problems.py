@@ -1,0 +1,197 @@
+"""A problem of the benchmark: the objective of one object as a function of a code."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxshape.bench.config import FRAMES, KINDS
+from jaxshape.bench.problem_set import ProblemSet, packaged_set
+from jaxshape.data.dataset import unpack, unpack_measured
+from jaxshape.geometry.grids import Grids
+from jaxshape.geometry.overlap import iou
+from jaxshape.model.shapes import ShapePrior, decode, encode, pick, share_all
+from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.search.objective import objective
+from jaxshape.search.residuals import BALANCED, SOFT, Residual, Target, cross_entropy
+
+WEIGHTS = "chair-autoencoder"
+"""The packaged weights whose codes are searched."""
+
+RESIDUALS = {"clean": BALANCED, "noisy": SOFT}
+"""What is minimised: the default objective of each kind of grids."""
+
+EQUATION_7 = Residual(BALANCED.target, cross_entropy)
+"""Scores the targets of either."""
+
+
+BOX = 10.0
+"""Half side of the box of a problem, in standard deviations of the codes; found codes stay within
+7."""
+
+
+class Problem(NamedTuple):
+    """One object after some number of frames, and the search for its code.
+
+    Attributes:
+        name: Name of the problem: `object/frames/kind`.
+        prior: The shape prior whose codes are searched.
+        decoder: The same with its parameters prepared once for all; it cannot encode.
+        grids: What was measured, F and M `[x y z]`, as probabilities.
+        surface: True surface voxels `[x y z]`, which no search may use.
+        target: Weights of Eq. 7 for each voxel.
+        first_code: The encoder's code `[d]`, where every search starts.
+        first_objective: Objective of the first code, in nats per voxel.
+        best_objective: The lowest objective known when the set was made.
+    """
+
+    name: str
+    prior: ShapePrior
+    decoder: ShapePrior
+    grids: Grids
+    surface: Bool[Array | np.ndarray, "x y z"]
+    target: Target
+    first_code: Float[Array, " d"]
+    first_objective: Float[Array, ""]
+    best_objective: float
+
+    def objective(self, code: Float[Array, " d"]) -> Float[Array, ""]:
+        """What a search minimises (Eq. 7), in nats per voxel.
+
+        A pure function of JAX: differentiate it, and `jax.vmap` it over codes.
+
+        Args:
+            code: A code `[d]`.
+        """
+        return objective(self.decoder, self.target, residual=EQUATION_7)(code)
+
+    def iou(self, code: Float[Array, " d"]) -> Float[Array, ""]:
+        """Overlap of the decoded shape with the true surface, 0 to 1.
+
+        Args:
+            code: A code `[d]`.
+        """
+        return iou(decode(self.decoder, code) > 0, self.surface)
+
+    @property
+    def bounds(self) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+        """Lowest and highest numbers of a box of codes, for searches that need one; no rule."""
+        half = BOX * jnp.sqrt(jnp.diag(self.prior.code_covariance))
+        return self.prior.code_mean - half, self.prior.code_mean + half
+
+
+def stacked_targets(problems: Sequence[Problem]) -> Target:
+    """The targets of problems `[problem ...]`."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *[one.target for one in problems])
+
+
+def objectives(
+    decoder: ShapePrior, targets: Target
+) -> Callable[[Int[Array, ""]], Callable[[Float[Array, " d"]], Float[Array, ""]]]:
+    """The objective of each of some problems, by its number.
+
+    Args:
+        decoder: The shape prior, its parameters prepared.
+        targets: Targets of the problems `[problem ...]`.
+    """
+    return lambda number: objective(decoder, pick(targets, number), residual=EQUATION_7)
+
+
+def problems(
+    *,
+    objects: int | None = None,
+    frames: Sequence[int] = FRAMES,
+    kinds: Sequence[str] = KINDS,
+    problem_set: ProblemSet | None = None,
+    prior: ShapePrior | None = None,
+) -> list[Problem]:
+    """The problems of the benchmark, or some of them. [host]
+
+    Args:
+        objects: How many objects, the first of the set; None for all. Two of three are procedural
+            chairs, the third is a CAD seat.
+        frames: Numbers of fused frames, among 1, 4 and 8.
+        kinds: `clean` for points of the paper's camera without noise, `noisy` for signed distances
+            of a Kinect's noisy frames.
+        problem_set: Another set of problems; None for the one that comes with the package.
+        prior: The shape prior that the set was made for; None for the package's.
+
+    Returns:
+        One problem for each object, number of frames and kind.
+
+    Raises:
+        ValueError: No problem is left, or the weights are not those of the set.
+    """
+    found = packaged_set() if problem_set is None else problem_set
+    prior = load_prior(WEIGHTS) if prior is None else prior
+    if fingerprint(prior) != found.weights:
+        raise ValueError(
+            f"{found.name} searches the codes of other weights than these; give the shape prior"
+            " that it was made for, or leave it out."
+        )
+    count = len(found.objects) if objects is None else objects
+    chosen = [
+        key
+        for key in found.keys()
+        if key[1] < count and FRAMES[key[2]] in frames and key[3] in kinds
+    ]
+    if not chosen:
+        raise ValueError(
+            f"{found.name} has no such problem; give objects from 1 to {len(found.objects)}, frames"
+            f" among {', '.join(map(str, FRAMES))} and kinds among {', '.join(KINDS)}."
+        )
+    both = prior, _prepared(prior)
+    made = {one.name: one for kind in KINDS for one in _of_kind(found, both, kind, chosen)}
+    return [made[name] for name, *_ in chosen]
+
+
+def _prepared(prior: ShapePrior) -> ShapePrior:
+    """A prior whose model has nothing left to prepare."""
+    params = jax.jit(lambda prior: prior.model.prepare(prior.params, None, "float32").shared)(prior)
+    return prior._replace(model=replace(prior.model, prepare=share_all), params=params)
+
+
+def _of_kind(
+    found: ProblemSet, priors: tuple[ShapePrior, ShapePrior], kind: str, keys: Sequence
+) -> list[Problem]:
+    """The problems of one kind among those of some keys."""
+    keys = [key for key in keys if key[3] == kind]
+    if not keys:
+        return []
+    packed = np.stack([found.measured[kind][o, place] for _, o, place, _ in keys])
+    grids = Grids(*map(jnp.asarray, unpack_measured(packed)[:2]))
+    codes, logits = _first(priors[0], grids)
+    targets, losses = jax.device_get(_objectives(grids, logits, RESIDUALS[kind]))
+    return [
+        Problem(
+            name=name,
+            prior=priors[0],
+            decoder=priors[1],
+            grids=jax.tree.map(lambda x, i=i: x[i], grids),
+            surface=unpack(found.surfaces[o]),
+            target=jax.tree.map(lambda x, i=i: x[i], targets),
+            first_code=codes[i],
+            first_objective=losses[i],
+            best_objective=found.best.get(name, float("nan")),
+        )
+        for i, (name, o, _, _) in enumerate(keys)
+    ]
+
+
+@jax.jit
+def _first(prior, grids):
+    """First codes of grids `[b x y z]`, and their decoded shapes."""
+    codes = encode(prior, grids)
+    return codes, decode(prior, codes)
+
+
+@partial(jax.jit, static_argnums=2)
+def _objectives(grids, logits, residual):
+    """Targets of grids `[b x y z]`, and the objectives of their first codes."""
+    targets = jax.vmap(residual.target)(grids, logits)
+    return targets, jax.vmap(residual.score)(logits, targets)

@@ -1,0 +1,189 @@
+"""Every evaluation of a search, counted by the problem and not by the search. [host]
+
+A watched objective is the objective itself, with one side effect: whatever evaluates it, in a
+compiled loop or outside, tells the observer which codes were evaluated and what they cost. A search
+so can neither forget an evaluation nor count one twice, and its own idea of its budget plays no
+part. A candidate is one decoder call. A gradient, a pass forward and one back, takes the time of
+three and counts as three.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Float, Int
+
+GRADIENT = 3
+"""Decoder calls that a value with its gradient counts as."""
+
+WatchedObjective = Callable[[Float[Array, " d"], Int[Array, ""]], Float[Array, ""]]
+
+
+class Improvement(NamedTuple):
+    """A code that was better than all before it.
+
+    Attributes:
+        calls: Decoder calls spent up to it, itself included; 0 for the first code.
+        seconds: Time since the search began.
+        loss: Its objective, in nats per voxel.
+        code: The code `[d]`.
+    """
+
+    calls: int
+    seconds: float
+    loss: float
+    code: Float[np.ndarray, " d"]
+
+
+class Observer:
+    """What a search evaluated of some problems, each within the same budget.
+
+    What is evaluated after the budget is spent does not count; nor does a gradient that only
+    begins within it.
+
+    Attributes:
+        budget: Decoder calls that each problem may spend.
+        calls: Decoder calls spent on each problem.
+        seconds: Time at which the last evaluation of each problem came in, since it began.
+        improvements: By problem, the codes that were better than all before them.
+    """
+
+    def __init__(self, budget: int) -> None:
+        self.budget = budget
+        self.calls: list[int] = []
+        self.seconds: list[float] = []
+        self.improvements: list[list[Improvement]] = []
+        self._clocks: list[tuple[float, float]] = []
+
+    def begin(
+        self,
+        codes: Float[Array | np.ndarray, "problem d"],
+        losses: Float[Array | np.ndarray, " problem"],
+    ) -> None:
+        """Start counting problems that are searched together; compiling should be over.
+
+        Args:
+            codes: First codes of the problems `[problem d]`, which cost nothing.
+            losses: Their objectives `[problem]`.
+        """
+        count = len(codes)
+        starts = zip(np.asarray(codes), np.asarray(losses).tolist(), strict=True)
+        self.calls, self.seconds = [0] * count, [0.0] * count
+        self.improvements = [[Improvement(0, 0.0, loss, code)] for code, loss in starts]
+        # Problems share the time that passes evenly.
+        self._clocks = [(time.perf_counter(), 1 / count)] * count
+
+    def begin_alone(self, problem: int) -> None:
+        """Start counting one of these problems anew, which is searched by itself from now on.
+
+        Args:
+            problem: Its number.
+        """
+        self.calls[problem], self.seconds[problem] = 0, 0.0
+        self.improvements[problem] = self.improvements[problem][:1]
+        self._clocks[problem] = time.perf_counter(), 1.0
+
+    @property
+    def spent(self) -> Bool[np.ndarray, " problem"]:
+        """Whether the budget of each problem is spent, as far as evaluations have come in."""
+        return np.array(self.calls) >= self.budget
+
+    def note(self, cost: int, owner: Any, codes: Any, losses: Any) -> None:
+        """Count some evaluations; codes that are not finite were not decoded and cost nothing.
+
+        Args:
+            cost: Decoder calls of each.
+            owner: The problem of each code `[n]`.
+            codes: The codes `[n d]`.
+            losses: Their objectives `[n]`.
+        """
+        now, codes = time.perf_counter(), np.asarray(codes)
+        decoded = np.flatnonzero(np.isfinite(codes).all(axis=-1))
+        owners, values = np.asarray(owner).tolist(), np.asarray(losses).tolist()
+        for row in decoded.tolist():
+            problem, loss = owners[row], values[row]
+            if self.calls[problem] >= self.budget:
+                continue
+            began, share = self._clocks[problem]
+            self.calls[problem] += cost
+            self.seconds[problem] = share * (now - began)
+            found, calls = self.improvements[problem], self.calls[problem]
+            if calls <= self.budget and loss < found[-1].loss:  # NaN is not lower
+                better = Improvement(calls, self.seconds[problem], loss, codes[row].copy())
+                found.append(better)
+
+
+def watched(
+    objective_of: Callable[[Int[Array, ""]], Callable[..., Float[Array, ""]]], observer: Observer
+) -> WatchedObjective:
+    """The objectives of a batch of problems, watched.
+
+    Args:
+        objective_of: The objective of a problem, by its number in the batch.
+        observer: Learns of every evaluation.
+
+    Returns:
+        `loss(code, owner)`, to be used under any `jax.vmap`s, and under `jax.grad` with respect to
+        the code.
+    """
+    told, told_of_gradient = _telling(observer, 1), _telling(observer, GRADIENT)
+
+    @jax.custom_vjp
+    def loss(code, owner):
+        return told(owner, code, objective_of(owner)(code))
+
+    def with_slope(code, owner):
+        value, slope = jax.value_and_grad(objective_of(owner))(code)
+        return told_of_gradient(owner, code, value), slope
+
+    loss.defvjp(with_slope, lambda slope, ct: (ct * slope, None))
+    return loss
+
+
+def _telling(observer: Observer, cost: int) -> Callable[..., Float[Array, ""]]:
+    """`(owner, code, loss) -> loss`, which tells the observer; a batch tells it all at once."""
+
+    @custom_vmap
+    def rows(owner, codes, losses):
+        jax.debug.callback(partial(observer.note, cost), owner, codes, losses)
+        return losses
+
+    @rows.def_vmap
+    def more_rows(size, batched, owner, codes, losses):
+        def flat(x, has_axis):
+            x = x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
+            return x.reshape(-1, *x.shape[2:])
+
+        out = rows(*map(flat, (owner, codes, losses), batched))
+        return out.reshape(size, -1), True
+
+    return lambda owner, code, loss: rows(owner[None], code[None], loss[None])[0]
+
+
+def evaluates_in_a_branch(step: Callable[..., Any], *examples: Any) -> bool:
+    """Whether a step evaluates a watched objective within a loop or a branch of unknown length.
+
+    In a batch, such a loop runs as long as the longest of all, and every branch is taken: a problem
+    would pay for the others.
+
+    Args:
+        step: One step of one problem.
+        examples: Arguments of the shapes that it takes.
+    """
+    return any(_has_effects(jax.make_jaxpr(step)(*examples).jaxpr))
+
+
+def _has_effects(program: Any):
+    """For all loops and branches of a program, whether they hold side effects."""
+    for equation in program.eqns:
+        if equation.primitive.name in ("while", "cond"):
+            yield bool(equation.effects)
+        for inner in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns")):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield from _has_effects(inner)

@@ -1,0 +1,96 @@
+"""A search on problems is the search that it is elsewhere, in any company."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxshape.bench.contest import contestant
+from jaxshape.bench.problems import EQUATION_7
+from jaxshape.bench.scoring import LADDER, rows_of
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.methods import build_refiner
+from jaxshape.search.run import refine
+from jaxshape.search.space import whitened
+
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+CONFIG = RefineConfig(population=4, tolerance=0.0)
+
+
+def searched(method, problems, prior, budget=64):
+    search, alone = contestant(method, prior, CONFIG, budget)
+    found = search(problems, 0)
+    return rows_of(problems, found.observer, found.stops), alone
+
+
+def test_adam_walks_as_it_does_in_refine(two, linear_prior):
+    """After c decoder calls, c / 3 gradients were taken."""
+    rows, alone = searched("gradient:adam", two, linear_prior)
+    refiner = build_refiner("gradient:adam", linear_prior.code_size, CONFIG)
+    codes = jnp.stack([one.first_code for one in two])
+    targets = jax.tree.map(lambda *x: jnp.stack(x), *[one.target for one in two])
+    found = refine(
+        jax.random.key(0), linear_prior, codes, targets, refiner, 21,
+        residual=EQUATION_7, space=whitened(linear_prior),
+    )  # fmt: skip
+    assert not alone
+    for i, one in enumerate(two):
+        steps = [rung // 3 for rung in LADDER if 0 < rung < 64]
+        expected = np.asarray(found.trace.best_loss)[i, np.array(steps) - 1]
+        got = rows[one.name]["objective"][1 : len(steps) + 1]
+        np.testing.assert_allclose(got, expected, rtol=1e-5)
+        assert rows[one.name]["calls"] == 66 and rows[one.name]["stop"] == "budget"
+
+
+def test_a_population_does_not_depend_on_its_company(two, linear_prior):
+    together, _ = searched("cma", two, linear_prior)
+    alone, _ = searched("cma", two[1:], linear_prior)
+    one, other = together[two[1].name], alone[two[1].name]
+    assert one["calls"] == other["calls"] == 64
+    np.testing.assert_allclose(one["objective"], other["objective"], rtol=1e-5)
+    assert one["objective"][-1] < one["objective"][0]
+
+
+def test_pycma_is_asked_and_told(two, linear_prior):
+    pytest.importorskip("cma")
+    rows, _ = searched("pycma", two, linear_prior)
+    for row in rows.values():
+        assert row["calls"] == 64 and row["objective"][-1] < row["objective"][0]
+
+
+STRANGER = """
+import jaxshape as js
+
+class Halve:
+    def __init__(self, seed, point, loss):
+        self.point, self.asked = point, 0
+
+    def ask(self):
+        self.asked += 1
+        return self.point[None] / 2**self.asked
+
+    def tell(self, points, losses):
+        return "tired" if self.asked == 3 else None
+
+def build(variant, dim, config):
+    return js.AskTell(Halve)
+
+def wrong(variant, dim, config):
+    return Halve
+"""
+
+
+def test_a_search_on_the_host_goes_by_its_import_path(two, linear_prior, tmp_path, monkeypatch):
+    (tmp_path / "halving_stranger.py").write_text(STRANGER)
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        rows, _ = searched("halving_stranger:build", two, linear_prior)
+        assert [(row["calls"], row["stop"]) for row in rows.values()] == [(3, "tired")] * 2
+        with pytest.raises(
+            ValueError, match="must return a jaxshape.Refiner or a jaxshape.AskTell"
+        ):
+            contestant("halving_stranger:wrong", linear_prior, CONFIG, 64)
+    finally:
+        sys.modules.pop("halving_stranger", None)
