@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from jaxshape.bench.config import FRAMES, KINDS, BenchConfig, KindName
+from jaxshape.claim import Output
 from jaxshape.cli.common import console, progress_bar, require
 from jaxshape.cli.options import checked_numbers
 
@@ -43,6 +44,11 @@ class Bench:
     search: tyro.conf.OmitArgPrefixes[BenchConfig] = BenchConfig()
     check: bool = False
     """Run nothing; say what is wrong with the results in the folder, computing objectives anew."""
+
+    @property
+    def writes(self) -> Output | None:
+        """What is written; machines with a part each may share it."""
+        return None if self.check or self.part != "1/1" else Output(self.output, goes_on=True)
 
     def run(self) -> None:
         from jaxshape.bench.entries import read_entries
