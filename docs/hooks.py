@@ -6,7 +6,7 @@ from pathlib import Path
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
-OUTSIDE = re.compile(r"\.\./((?:experiments|benchmarks)/results/[\w-]+\.(?:png|gif))")
+OUTSIDE = re.compile(r"\.\./((?:experiments|benchmarks)/(?:results|board)/[\w-]+\.(?:png|gif))")
 
 
 def on_files(files, config):

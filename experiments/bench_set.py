@@ -12,6 +12,7 @@ jaxshape-bench-1.json. The set is frozen: this script is kept to show how it was
 were searched are kept in the results folder. Time: 20 minutes on two cores.
 """
 
+import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,8 @@ from jaxshape.bench.config import FRAMES
 from jaxshape.bench.problem_set import NAME, ProblemSet, fingerprint, write_set
 from jaxshape.bench.problems import EQUATION_7, WEIGHTS, Problem, problems
 from jaxshape.data.archives import list_meshes
-from jaxshape.data.dataset import TEST_SEEDS, Object, load_object, pack, pack_measured
+from jaxshape.data.dataset import Object, load_object, pack, pack_measured
+from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.data.meshes import Skipped
 from jaxshape.model import weights
 from jaxshape.model.weights import load_prior
@@ -41,7 +43,7 @@ KINDS = {
     "clean": EvaluateConfig(camera="paper", frames=FRAMES),
     "noisy": EvaluateConfig(camera="kinect", frames=FRAMES),
 }
-CHAIRS = 16
+LIST = Path(__file__).with_name("cad_seats.json")
 SEATS = (
     "blendswap_cc_0_armchair_armchair",
     "blendswap_cc_0_oakchair_oakchair",
@@ -52,7 +54,7 @@ SEATS = (
     "blendswap_cc_0_deckchair_deckchair",
     "blendswap_cc_0_osakachair_osakachair",
 )
-"""CAD seats by their names in experiments/cad_seats.json; all of them are CC0."""
+"""CAD seats by their names in the list; all of them are CC0."""
 
 
 @dataclass(frozen=True)
@@ -80,18 +82,16 @@ def main(config: Config) -> None:
 
 def items(meshes: Path) -> list[tuple[Object, dict[str, str]]]:
     """The objects, two procedural chairs before each seat, with what is to be told of them."""
-    from cad_seats import read_list
-
     files = {source.name: source for source in list_meshes(meshes)}
-    listed = {seat.name: seat for seat in read_list()}
+    listed = {seat["name"]: seat for seat in json.loads(LIST.read_text(encoding="utf-8"))}
     found = []
     for i, name in enumerate(SEATS):
-        for seed in (TEST_SEEDS + 2 * i, TEST_SEEDS + 2 * i + 1):
-            found.append((seed, {"name": f"chair-{seed}", "source": "procedural"}))
+        for chair in procedural_objects("chair", 2, TEST_SEEDS + 2 * i):
+            found.append((chair, {"name": chair.name, "source": "procedural"}))
         seat = listed[name]
-        assert seat.licence == "CC0"
-        about = {"title": seat.title, "creator": seat.creator, "licence": seat.licence}
-        found.append((files[name], {"name": name, "source": seat.package} | about))
+        assert seat["licence"] == "CC0"
+        about = {key: seat[key] for key in ("title", "creator", "licence")}
+        found.append((files[name], {"name": name, "source": seat["package"]} | about))
     return found
 
 

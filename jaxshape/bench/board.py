@@ -15,6 +15,7 @@ from jaxshape.bench.standings import (
     COLUMNS,
     Standing,
     conditions,
+    headings,
     markdown,
     table,
 )
@@ -76,7 +77,11 @@ def draw(path: Path, found: Sequence[Standing]) -> None:
         for axes in (by_calls, by_seconds, by_gap):
             tidy(axes)
         for axes in (by_calls, by_seconds):
-            axes.set(xscale="log", ylim=(0, 1))
+            axes.set(xscale="log", ylim=(0, 1.02))
+            axes.xaxis.set_major_formatter("{x:g}")
+        ticks = [LADDER[1], BUDGETS[0] // 4, *BUDGETS]
+        by_calls.set_xticks(ticks, [str(calls) for calls in ticks])
+        by_calls.minorticks_off()
         figure.legend(loc="outside lower center", ncols=4, frameon=False)
 
     rows = -(-len(found) // 4)
@@ -105,7 +110,9 @@ def _page(title: str, found: Sequence[Standing], picture: Path) -> str:
     numbers = tuple(range(1, len(COLUMNS) - 1))
     body = [
         f"<section><h2>The board</h2>{_paragraphs([ABOUT])}",
-        html_table(COLUMNS, [[escape(cell) for cell in row] for row in table(found)], numbers),
+        html_table(
+            headings("<br>"), [[escape(cell) for cell in row] for row in table(found)], numbers
+        ),
         "</section><section><h2>Against decoder calls, seconds and the objective</h2>"
         f'<figure><img src="data:image/png;base64,{data}" alt="Shares of targets reached against'
         ' decoder calls and against seconds, and IoU against the objective"></figure></section>',

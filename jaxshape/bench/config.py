@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from jaxshape import checks
-from jaxshape.search.config import RefineConfig, Space
+from jaxshape.search.config import Number, RefineConfig, Space
 
 KindName = Literal["clean", "noisy"]
 KINDS: tuple[KindName, ...] = get_args(KindName)
@@ -55,11 +55,11 @@ class BenchConfig:
     """
 
     population: int = RefineConfig.population
-    sigma0: float = RefineConfig.sigma0
+    sigma0: Number = RefineConfig.sigma0
     step_size: float | None = None
     space: Space = RefineConfig.space
     bound: float | None = None
-    tolerance: float = RefineConfig.tolerance
+    tolerance: Number = RefineConfig.tolerance
     budget: int = BUDGETS[-1]
     seed: int = 0
     at_a_time: int = AT_A_TIME

@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxshape.bench.ask_tell import ASK_TELL, AskTell
 from jaxshape.bench.problems import Problem, objectives, stacked_targets
-from jaxshape.bench.watching import Observer, WatchedObjective, evaluates_in_a_branch, watched
+from jaxshape.bench.watching import Observer, evaluates_in_a_branch, watched
 from jaxshape.data.dataset import hash_seed
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.config import RefineConfig
@@ -42,13 +43,13 @@ Contestant = Callable[[Sequence[Problem], int], Outcome]
 
 
 def contestant(
-    method: str, prior: ShapePrior, config: RefineConfig, budget: int
+    method: str, example: Problem, config: RefineConfig, budget: int
 ) -> tuple[Contestant, bool]:
     """A search by its name, ready to be run on problems.
 
     Args:
         method: Name of a search (`jaxshape.search.names`), `pycma`, or `nevergrad:NAME`.
-        prior: The shape prior of the problems.
+        example: Any of the problems.
         config: Settings of the search.
         budget: Decoder calls that each problem may spend.
 
@@ -59,13 +60,13 @@ def contestant(
     Raises:
         ValueError: There is no such search, or it refuses its settings.
     """
-    field = _Field(prior, search_space(prior, config), Observer(budget))
+    field = _field(example, config, budget)
     family, _, variant = method.partition(":")
     if family in ASK_TELL:
         build, found = ASK_TELL[family], variant or None
     else:
         build, found = find_build(method)
-    search = build(found, prior.code_size, config)
+    search = build(found, example.prior.code_size, config)
     if isinstance(search, AskTell):
         return _on_the_host(search, field), False
     if not isinstance(search, Refiner):
@@ -73,15 +74,15 @@ def contestant(
             f"The method {method!r} returned {type(search).__name__}; it must return a"
             " jaxshape.Refiner or a jaxshape.AskTell."
         )
-    return _compiled(search, field), _must_be_alone(search, prior.code_size)
+    return _compiled(search, field), _must_be_alone(search, field, example)
 
 
-def _must_be_alone(refiner: Refiner, dim: int) -> bool:
+def _must_be_alone(refiner: Refiner, field: "_Field", example: Problem) -> bool:
     """Whether a step of the search evaluates within a loop or a branch, as line searches do."""
-    loss = watched(lambda owner: lambda code: jnp.sum(code**2), Observer(1))
-    key, owner, point = jax.random.key(0), jnp.int32(0), jnp.zeros(dim)
+    objective = field.objectives(field.decoder, stacked_targets([example]))(jnp.int32(0))
+    point, key = field.space.from_code(example.first_code), jax.random.key(0)
     state, _ = refiner.init(key, point, jnp.float32(1))
-    step = lambda key, state: refiner.step(key, state, lambda code: loss(code, owner))  # noqa: E731
+    step = lambda key, state: refiner.step(key, state, objective)  # noqa: E731
     return evaluates_in_a_branch(step, key, state)
 
 
@@ -92,25 +93,23 @@ class _Field(NamedTuple):
     """Where a method is run.
 
     Attributes:
-        prior: The shape prior of the problems.
+        decoder: The shape prior, which takes points of the search space for codes.
         space: Coordinates of the search.
         observer: Counts what is evaluated.
     """
 
-    prior: ShapePrior
+    decoder: ShapePrior
     space: LatentSpace
     observer: Observer
 
-    def loss(self, decoder: ShapePrior, targets: Target) -> WatchedObjective:
-        """The watched objective `loss(point, number of the problem)`."""
-        of_code = watched(objectives(decoder, targets), self.observer)
-        return lambda point, owner: of_code(self.space.to_code(point), owner)
+    def objectives(self, decoder: ShapePrior, targets: Target) -> Callable[..., Any]:
+        """The watched objectives of points, by the number of the problem."""
+        return watched(objectives(decoder, targets), self.observer, self.space.to_code)
 
     def start(self, problems: Sequence[Problem], seed: int) -> "_Start":
         """Stack the arrays of problems."""
         codes = jnp.stack([one.first_code for one in problems])
         return _Start(
-            decoder=problems[0].decoder,
             targets=stacked_targets(problems),
             codes=codes,
             points=jax.vmap(self.space.from_code)(codes),
@@ -119,11 +118,21 @@ class _Field(NamedTuple):
         )
 
 
+def _field(example: Problem, config: RefineConfig, budget: int) -> _Field:
+    """The decoder of a problem, in the coordinates that the settings name."""
+    space, decoder = search_space(example.prior, config), example.decoder
+
+    def decode(prepared, points):
+        return decoder.model.decode(prepared, jax.vmap(space.to_code)(points))
+
+    in_points = decoder._replace(model=replace(decoder.model, decode=decode))
+    return _Field(in_points, space, Observer(budget))
+
+
 class _Start(NamedTuple):
     """Where the searches of some problems start.
 
     Attributes:
-        decoder: The shape prior, its parameters prepared.
         targets: Targets of the problems `[problem ...]`.
         codes: First codes `[problem d]`.
         points: The same in the search space `[problem d]`.
@@ -131,7 +140,6 @@ class _Start(NamedTuple):
         seeds: A seed for each problem, whatever its company.
     """
 
-    decoder: ShapePrior
     targets: Target
     codes: Float[Array, "problem d"]
     points: Float[Array, "problem d"]
@@ -149,10 +157,10 @@ def _compiled(refiner: Refiner, field: _Field) -> Contestant:
         return refiner.init(jax.random.fold_in(key, 0), point, loss)
 
     def move(decoder, targets, number, spent, key, owner, state, trace):
-        loss = field.loss(decoder, targets)
+        objective = field.objectives(decoder, targets)(owner)
         stop = jnp.where((state.stop == 0) & spent, StopReason.BUDGET, state.stop)
         state, key = state._replace(stop=stop), jax.random.fold_in(key, number)
-        return advance(refiner, key, state, trace, lambda point: loss(point, owner))
+        return advance(refiner, key, state, trace, objective)
 
     move_all = jax.jit(jax.vmap(move, (None, None, None, 0, 0, 0, 0, 0)))
 
@@ -162,13 +170,13 @@ def _compiled(refiner: Refiner, field: _Field) -> Contestant:
         owners, spent = jnp.arange(len(problems)), np.zeros(len(problems), bool)
         now = begin(keys, at.points, at.losses)
         if len(problems) not in programs:
-            shapes = at.decoder, at.targets, jnp.int32(1), jnp.asarray(spent), keys, owners, *now
+            shapes = field.decoder, at.targets, jnp.int32(1), jnp.asarray(spent), keys, owners, *now
             programs[len(problems)] = move_all.lower(*shapes).compile()
         step, compiling = programs[len(problems)], time.perf_counter() - began
         observer.begin(at.codes, at.losses)
         for number in range(1, observer.budget + 2):  # a search that evaluates nothing ends too
             more = jnp.int32(number), jnp.asarray(spent), keys, owners
-            now = step(at.decoder, at.targets, *more, *now)
+            now = step(field.decoder, at.targets, *more, *now)
             jax.effects_barrier()
             spent = observer.spent
             stops = np.where(spent & (now[0].stop == 0), StopReason.BUDGET, now[0].stop)
@@ -186,8 +194,9 @@ def _on_the_host(search: AskTell, field: _Field) -> Contestant:
 
     @jax.jit
     def evaluate(decoder, targets, points):
-        loss = field.loss(decoder, targets)
-        return jax.vmap(jax.vmap(loss, (0, None)))(points, jnp.arange(len(points)))
+        each = field.objectives(decoder, targets)
+        of_points = lambda owner, points: jax.vmap(each(owner))(points)  # noqa: E731
+        return jax.vmap(of_points)(jnp.arange(len(points)), points)
 
     def run(problems, seed):
         at = field.start(problems, seed)
@@ -197,11 +206,11 @@ def _on_the_host(search: AskTell, field: _Field) -> Contestant:
         asked, began = [one.ask() for one in searches], time.perf_counter()
         nothing = np.nan * _stacked(asked, stops)
         observer.begin(at.codes, at.losses)
-        jax.block_until_ready(evaluate(at.decoder, at.targets, nothing))
+        jax.block_until_ready(evaluate(field.decoder, at.targets, nothing))
         compiling = time.perf_counter() - began
         observer.begin(at.codes, at.losses)
         while None in stops:
-            losses = np.asarray(evaluate(at.decoder, at.targets, _stacked(asked, stops)))
+            losses = np.asarray(evaluate(field.decoder, at.targets, _stacked(asked, stops)))
             jax.effects_barrier()
             for i, one in enumerate(searches):
                 if stops[i] is None:

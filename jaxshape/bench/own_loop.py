@@ -1,7 +1,7 @@
 """Your own loop over problems, watched, so that its result can stand on the board. [host]"""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,8 @@ from jaxshape.bench.config import BUDGETS, LADDER
 from jaxshape.bench.entries import file_name, new_entry, read_entry, with_rows, write_entry
 from jaxshape.bench.problems import Problem, objectives, stacked_targets
 from jaxshape.bench.scoring import Row, rows_of
-from jaxshape.bench.watching import Observer, WatchedObjective, watched
+from jaxshape.bench.watching import Observer, watched
+from jaxshape.search.residuals import Target
 
 
 @dataclass(frozen=True)
@@ -41,12 +42,16 @@ class Watch:
             checks.refuse("problems", self.problems, "one problem or more")
         checks.whole("budget", self.budget, LADDER[1])
         checks.within("budget", self.budget, LADDER[1], LADDER[-1])
+        self.begin()
+        _ = self._watched  # its arrays are made now, before anything is traced
 
     @cached_property
     def _observer(self) -> Observer:
-        observer = Observer(self.budget)
-        observer.begin(*self._first)
-        return observer
+        return Observer(self.budget)
+
+    @cached_property
+    def _targets(self) -> Target:
+        return stacked_targets(self.problems)
 
     @cached_property
     def _first(self) -> tuple[Float[Array, "problem d"], Float[np.ndarray, " problem"]]:
@@ -54,9 +59,8 @@ class Watch:
         return codes, np.array([one.first_objective for one in self.problems])
 
     @cached_property
-    def _watched(self) -> WatchedObjective:
-        each = objectives(self.problems[0].decoder, stacked_targets(self.problems))
-        return watched(each, self._observer)
+    def _watched(self) -> Callable[[Int[Array, ""]], Any]:
+        return watched(objectives(self.problems[0].decoder, self._targets), self._observer)
 
     def objective(
         self, code: Float[Array, " d"], number: Int[Array, ""] | int = 0
@@ -69,7 +73,7 @@ class Watch:
             code: A code `[d]`.
             number: Number of the problem; it may be traced, so that one program serves all.
         """
-        return self._watched(code, jnp.asarray(number, jnp.int32))
+        return self._watched(jnp.asarray(number, jnp.int32))(code)
 
     def begin(self, number: int | None = None) -> None:
         """Start counting anew, and the clock; what came before was to compile.

@@ -60,8 +60,8 @@ def run(
         ValueError: There is no such method, or the folder holds results of the same method that
             were made in another way.
     """
-    prior, settings = problems[0].prior, config.search()
-    searches = {one: contestant(one, prior, settings, config.budget) for one in methods}
+    settings = config.search()
+    searches = {one: contestant(one, problems[0], settings, config.budget) for one in methods}
     for method, (search, alone) in searches.items():
         name = config.name_of(method)
         entry = new_entry(

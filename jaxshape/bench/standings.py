@@ -1,5 +1,6 @@
 """Entries against each other: shares of targets reached, and the table of a board. [host]"""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,7 +20,7 @@ class Standing(NamedTuple):
     """One entry on the problems that all entries have.
 
     Attributes:
-        entry: The entry.
+        entry: The entry, with these problems alone.
         calls: Decoder calls at which each target by objective was reached `[problem target]`; +inf
             where it was not.
         seconds: The same in seconds.
@@ -64,10 +65,13 @@ class Standing(NamedTuple):
         most = (within - self.iou[:, :1]).max(axis=1)
         return float((most[:, None] >= np.array(GAINS)).mean())
 
-    @property
-    def area(self) -> float:
-        """Mean share of the targets reached, over the logarithm of decoder calls."""
-        return float(np.mean([self.share(calls=rung) for rung in LADDER[1:]]))
+    def area(self, calls: int) -> float:
+        """Mean share of the targets reached, over the logarithm of decoder calls.
+
+        Args:
+            calls: The budget up to which it is taken.
+        """
+        return float(np.mean([self.share(rung) for rung in LADDER[1:] if rung <= calls]))
 
 
 def shared_problems(entries: Sequence[Entry]) -> list[str]:
@@ -77,7 +81,7 @@ def shared_problems(entries: Sequence[Entry]) -> list[str]:
 
 
 def standings(entries: Sequence[Entry], best: dict[str, float]) -> list[Standing]:
-    """Entries on the problems that all of them have, the best first.
+    """Entries on the problems that all of them have, the best within the least budget first.
 
     Args:
         entries: The entries.
@@ -99,14 +103,15 @@ def standings(entries: Sequence[Entry], best: dict[str, float]) -> list[Standing
         objective = np.array([row["objective"] for row in rows])
         found.append(
             Standing(
-                entry=entry,
+                entry=entry._replace(rows=dict(zip(names, rows, strict=True))),
                 calls=_reached(rows, 0),
                 seconds=_reached(rows, 1),
                 gap=(objective - lowest) / (objective[:, :1] - lowest),
                 iou=np.array([row["iou"] for row in rows]),
             )
         )
-    return sorted(found, key=lambda one: -one.area)
+    least = min(one.budget for one in found)
+    return sorted(found, key=lambda one: -one.area(least))
 
 
 def _reached(rows: Sequence[Row], column: int) -> Float[np.ndarray, "problem target"]:
@@ -121,8 +126,8 @@ def _reached(rows: Sequence[Row], column: int) -> Float[np.ndarray, "problem tar
 
 COLUMNS = (
     "method",
-    *(f"targets, {calls} calls" for calls in BUDGETS),
-    f"targets, {SECONDS:g} s",
+    *(f"in {calls} calls" for calls in BUDGETS),
+    f"in {SECONDS:g} s",
     "calls to 95 %",
     "s to 95 %",
     "IoU",
@@ -132,13 +137,22 @@ COLUMNS = (
 )
 
 ABOUT = (
-    f"Targets by objective leave {LEFT[0]:.0%} to {LEFT[-1]:.0%} of the gap between the objective"
-    " of the first code and the lowest known; their shares are over all problems and targets,"
-    " within so many decoder calls, or seconds, of each problem. Calls and seconds to 95 % are"
-    " medians over problems, a dash where fewer than half were brought so near. IoU is that of the"
-    " last best code, gained what it has over the first code's; targets by IoU are gains of"
+    "The first figures are the shares of targets that were reached within so many decoder calls, or"
+    f" seconds, of each problem. Targets by objective leave {LEFT[0]:.0%} to {LEFT[-1]:.0%} of the"
+    " gap between the objective of the first code and the lowest known. Calls and seconds to 95 %"
+    " are medians over problems, a dash where fewer than half were brought so near. IoU is that of"
+    " the last best code, gained what it has over the first code's; targets by IoU are gains of"
     f" {', '.join(f'{gain:g}' for gain in GAINS)} along the way. A gradient counts as three calls."
 )
+
+
+def headings(line_break: str) -> list[str]:
+    """The columns with their names on two lines.
+
+    Args:
+        line_break: What ends a line.
+    """
+    return [re.sub(" (calls|to|targets)", rf"{line_break}\1", column) for column in COLUMNS]
 
 
 def table(found: Sequence[Standing]) -> list[list[str]]:

@@ -18,10 +18,10 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxshape.search.curvature import Composed
+
 GRADIENT = 3
 """Decoder calls that a value with its gradient counts as."""
-
-WatchedObjective = Callable[[Float[Array, " d"], Int[Array, ""]], Float[Array, ""]]
 
 
 class Improvement(NamedTuple):
@@ -119,30 +119,51 @@ class Observer:
 
 
 def watched(
-    objective_of: Callable[[Int[Array, ""]], Callable[..., Float[Array, ""]]], observer: Observer
-) -> WatchedObjective:
-    """The objectives of a batch of problems, watched.
+    objective_of: Callable[[Int[Array, ""]], Any],
+    observer: Observer,
+    to_code: Callable[[Float[Array, " d"]], Float[Array, " d"]] = lambda point: point,
+) -> Callable[[Int[Array, ""]], Any]:
+    """The objectives of some problems, watched.
 
     Args:
-        objective_of: The objective of a problem, by its number in the batch.
+        objective_of: The objective of a problem, by its number. One that is `Composed`, so that a
+            search can ask for it to second order, stays so.
         observer: Learns of every evaluation.
+        to_code: The code of a point that the objectives take.
 
     Returns:
-        `loss(code, owner)`, to be used under any `jax.vmap`s, and under `jax.grad` with respect to
-        the code.
+        The watched objective of a problem, by its number, to be used under any `jax.vmap`s and
+        under `jax.grad`.
     """
-    told, told_of_gradient = _telling(observer, 1), _telling(observer, GRADIENT)
+
+    def told(cost, owner, point, loss):
+        return _telling(observer, cost)(owner, to_code(point), loss)
 
     @jax.custom_vjp
-    def loss(code, owner):
-        return told(owner, code, objective_of(owner)(code))
+    def loss_of(point, owner):
+        return told(1, owner, point, objective_of(owner)(point))
 
-    def with_slope(code, owner):
-        value, slope = jax.value_and_grad(objective_of(owner))(code)
-        return told_of_gradient(owner, code, value), slope
+    def with_slope(point, owner):
+        value, slope = jax.value_and_grad(objective_of(owner))(point)
+        return told(GRADIENT, owner, point, value), slope
 
-    loss.defvjp(with_slope, lambda slope, ct: (ct * slope, None))
-    return loss
+    loss_of.defvjp(with_slope, lambda slope, ct: (ct * slope, None))
+
+    def watched_of(owner):
+        objective = objective_of(owner)
+
+        def loss(point):
+            return loss_of(point, owner)
+
+        def expansion(point, directions):
+            """A product with the matrix takes the time of a gradient."""
+            found = objective.expansion(point, directions)
+            cost = GRADIENT * (1 + len(found.directions))
+            return found._replace(loss=told(cost, owner, point, found.loss))
+
+        return Composed(loss, expansion) if isinstance(objective, Composed) else loss
+
+    return watched_of
 
 
 def _telling(observer: Observer, cost: int) -> Callable[..., Float[Array, ""]]:

@@ -47,8 +47,12 @@ class Bench:
 
     @property
     def writes(self) -> Output | None:
-        """What is written; machines with a part each may share it."""
-        return None if self.check or self.part != "1/1" else Output(self.output, goes_on=True)
+        """What is written; the parts of a board may be made at the same time."""
+        if self.check:
+            return None
+        i, n = _part(self.part)
+        part = self.output / f"part-{i}-of-{n}"
+        return Output(part if n > 1 else self.output, is_file=n > 1, goes_on=True)
 
     def run(self) -> None:
         from jaxshape.bench.entries import read_entries
@@ -108,13 +112,13 @@ def _check(folder: Path) -> None:
 
 def _board(folder: Path, found: Any, problem_set: Any) -> None:
     from jaxshape.bench.board import write_board
-    from jaxshape.bench.standings import COLUMNS, conditions, table
+    from jaxshape.bench.standings import COLUMNS, conditions, headings, table
 
     write_board(folder, found, problem_set)
     shown = Table(title=f"{len(found[0].calls)} problems", box=None, padding=(0, 1, 0, 0))
     kept = [i for i, column in enumerate(COLUMNS) if column not in ("IoU targets", "stopped by")]
     for i in kept:  # 80 columns hold them
-        header = COLUMNS[i].replace(", ", "\n").replace(" to ", "\nto ")
+        header = headings("\n")[i]
         shown.add_column(header, justify="right" if i else "left", no_wrap=True)
     for row in table(found):
         shown.add_row(*(escape(row[i]) for i in kept))

@@ -19,15 +19,15 @@ pytestmark = pytest.mark.usefixtures("compile_quickly")
 CONFIG = RefineConfig(population=4, tolerance=0.0)
 
 
-def searched(method, problems, prior, budget=64):
-    search, alone = contestant(method, prior, CONFIG, budget)
+def searched(method, problems, budget=64):
+    search, alone = contestant(method, problems[0], CONFIG, budget)
     found = search(problems, 0)
     return rows_of(problems, found.observer, found.stops), alone
 
 
 def test_adam_walks_as_it_does_in_refine(two, linear_prior):
     """After c decoder calls, c / 3 gradients were taken."""
-    rows, alone = searched("gradient:adam", two, linear_prior)
+    rows, alone = searched("gradient:adam", two)
     refiner = build_refiner("gradient:adam", linear_prior.code_size, CONFIG)
     codes = jnp.stack([one.first_code for one in two])
     targets = jax.tree.map(lambda *x: jnp.stack(x), *[one.target for one in two])
@@ -44,18 +44,18 @@ def test_adam_walks_as_it_does_in_refine(two, linear_prior):
         assert rows[one.name]["calls"] == 66 and rows[one.name]["stop"] == "budget"
 
 
-def test_a_population_does_not_depend_on_its_company(two, linear_prior):
-    together, _ = searched("cma", two, linear_prior)
-    alone, _ = searched("cma", two[1:], linear_prior)
+def test_a_population_does_not_depend_on_its_company(two):
+    together, _ = searched("evosax:SNES", two)
+    alone, _ = searched("evosax:SNES", two[1:])
     one, other = together[two[1].name], alone[two[1].name]
     assert one["calls"] == other["calls"] == 64
     np.testing.assert_allclose(one["objective"], other["objective"], rtol=1e-5)
     assert one["objective"][-1] < one["objective"][0]
 
 
-def test_pycma_is_asked_and_told(two, linear_prior):
+def test_pycma_is_asked_and_told(two):
     pytest.importorskip("cma")
-    rows, _ = searched("pycma", two, linear_prior)
+    rows, _ = searched("pycma", two)
     for row in rows.values():
         assert row["calls"] == 64 and row["objective"][-1] < row["objective"][0]
 
@@ -82,15 +82,15 @@ def wrong(variant, dim, config):
 """
 
 
-def test_a_search_on_the_host_goes_by_its_import_path(two, linear_prior, tmp_path, monkeypatch):
+def test_a_search_on_the_host_goes_by_its_import_path(two, tmp_path, monkeypatch):
     (tmp_path / "halving_stranger.py").write_text(STRANGER)
     monkeypatch.syspath_prepend(tmp_path)
     try:
-        rows, _ = searched("halving_stranger:build", two, linear_prior)
+        rows, _ = searched("halving_stranger:build", two)
         assert [(row["calls"], row["stop"]) for row in rows.values()] == [(3, "tired")] * 2
         with pytest.raises(
             ValueError, match="must return a jaxshape.Refiner or a jaxshape.AskTell"
         ):
-            contestant("halving_stranger:wrong", linear_prior, CONFIG, 64)
+            contestant("halving_stranger:wrong", two[0], CONFIG, 64)
     finally:
         sys.modules.pop("halving_stranger", None)

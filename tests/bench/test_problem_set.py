@@ -11,6 +11,7 @@ from jaxshape.bench import problem_set as sets
 from jaxshape.bench.config import FRAMES, KINDS
 from jaxshape.bench.problems import WEIGHTS, problems
 from jaxshape.data.dataset import load_object, pack_measured, unpack
+from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import observe
 
@@ -45,7 +46,7 @@ def test_the_script_measures_what_is_stored(packaged):
     sys.path.insert(0, str(ROOT / "experiments"))
     import bench_set
 
-    chair = load_object(1_000_000)
+    (chair,) = map(load_object, procedural_objects("chair", 1, TEST_SEEDS))
     for kind, config in bench_set.KINDS.items():
         case = observe(chair, config)
         stored = packaged.measured[kind][0]

@@ -26,7 +26,8 @@ def observer():
 
 @pytest.fixture
 def loss(observer):
-    return watched(objective_of, observer)
+    each = watched(objective_of, observer)
+    return lambda code, owner: each(owner)(code)
 
 
 def test_values_and_gradients_are_those_of_the_objective(loss):
