@@ -27,6 +27,7 @@ from rich.progress import track
 
 from jaxshape.data import meshes
 from jaxshape.data.split import hold_out
+from jaxshape.data.survey import survey
 from jaxshape.files import atomic_path
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
@@ -179,7 +180,8 @@ def draw(mesh: trimesh.Trimesh, case: Any, found: Any) -> list[Panel]:
 
 def plot(config: Config, prior: ShapePrior, rows: int = 4) -> None:
     """Draw mugs held out of training, a row for each."""
-    held_out = hold_out(meshes.list_meshes(config.output))[1][:rows]
+    found = dict(survey(meshes.list_meshes(config.output), front="x", workers=1))
+    held_out = hold_out([found[i] for i in sorted(found)])[1][:rows]
     models = [cast(meshes.Model, meshes.load(source, front="x")) for source in held_out]
     seen = [cast(Case, observe(model, replace(SEEN, frames=(4,)))) for model in models]
     cases = jax.tree.map(lambda *x: jnp.concatenate(x), *seen)

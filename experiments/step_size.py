@@ -75,7 +75,7 @@ SETTINGS = {
 DEFAULTS = {
     DESCENT: Trial("whitened", STEP_SIZES["whitened"]),
     "Adam": Trial("whitened", LEARNING_RATE),
-    "CMA-ES": Trial("whitened", RefineConfig().sigma0),
+    "CMA-ES": Trial("whitened", float(RefineConfig().sigma0)),
 }
 PAPERS = {DESCENT: Trial("raw", 0.14), "CMA-ES": Trial("raw", 2.0)}
 TRIALS = {

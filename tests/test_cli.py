@@ -1,11 +1,11 @@
 """The command line: what is refused, in one sentence and with nothing touched, and what works."""
 
+import io
 import json
 import os
 import re
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import islice
 
@@ -14,16 +14,22 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from rich.console import Console
 from scene import write_scene
 
 from jaxshape import cli, process
+from jaxshape.cli import collection as collections
+from jaxshape.cli import common
 from jaxshape.cli.learning import preset_in
-from jaxshape.data import dataset
-from jaxshape.data.archives import list_meshes
+from jaxshape.cli.options import Axes
+from jaxshape.data import building, dataset
+from jaxshape.data.archives import MeshSource, list_meshes
 from jaxshape.data.camera_config import CameraConfig
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.families import TEST_SEEDS
+from jaxshape.data.meshes import Skipped
 from jaxshape.data.split import hold_out
+from jaxshape.data.survey import look
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map import mapper
 from jaxshape.mapping.placement import finding
@@ -223,7 +229,7 @@ def chair(tmp_path_factory):
         (("--seed", "-1"), "--seed is -1; give a whole number, 0 or more"),
         (("--depth-scale", "inf"), "The depth scale is inf"),
         (("--depth-scale", "nan"), "The depth scale is nan"),
-        (("--click", "nan", "1"), "--click is nan 1.0"),
+        (("--click", "nan", "1"), "--click is nan"),
     ],
 )
 def test_options_of_a_scan_out_of_range_are_refused(scene, refused, tmp_path, options, said, prior):
@@ -292,7 +298,7 @@ def test_options_of_an_evaluation_out_of_range_are_refused(
     assert said in refused("evaluate", *some, *options)
 
 
-def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior):
+def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior, monkeypatch):
     save_prior(tmp_path / "tiny.safetensors", prior, {})
     tiny = ("--weights", tmp_path / "tiny.safetensors")
     (tmp_path / "empty.ply").write_bytes(b"")
@@ -303,6 +309,7 @@ def test_meshes_that_cannot_be_used_are_refused(chair, refused, tmp_path, prior)
     lying = trimesh.load_mesh(chair)
     lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     lying.export(tmp_path / "lying.ply")
+    monkeypatch.setattr(collections, "_scores", lambda *_, **__: {})
     said = refused("evaluate", "--meshes", tmp_path / "lying.ply")
     assert "lie on their side" in said and "--up z" in said
 
@@ -516,7 +523,7 @@ def test_the_camera_and_the_switches_of_a_search_reach_the_evaluation(
     assert config.refine == RefineConfig(objective="paper", symmetry=False)
 
 
-def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
+def test_a_killed_evaluation_goes_on_with_the_same_weights_and_meshes_only(
     run, chair, tmp_path, monkeypatch, linear_prior
 ):
     asked, weights = [], tmp_path / "weights.safetensors"
@@ -526,8 +533,8 @@ def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
         asked.append(len(models))
         for model in models:
             scores = {"1": {"encoder": {"iou": 1.0}, "bounds": {"occluded_empty": 1.0}}}
-            yield {"name": model.name, "metadata": {}, "frames": scores}
-            if len(asked) < 3:
+            yield {"name": model.name, "content": model.digest, "metadata": {}, "frames": scores}
+            if len(asked) < 4:
                 raise OSError("killed.")
 
     monkeypatch.setattr(evaluation, "evaluate", evaluate)
@@ -536,11 +543,64 @@ def test_a_killed_evaluation_goes_on_with_the_same_weights_only(
         (tmp_path / "meshes" / name).write_bytes(chair.read_bytes())
     arguments = ("--meshes", tmp_path / "meshes", "--frames", 1, "--methods", "encoder")
     arguments += ("--weights", weights)
-    for status in (2, 2, 0):
+    for status in (2, 2, 2, 0):
         assert run("evaluate", *arguments, "--output", tmp_path / "scores.json")[0] == status
         if len(asked) == 1:
             save_prior(weights, linear_prior._replace(code_mean=linear_prior.code_mean + 1), {})
-    assert asked == [3, 3, 2]
+        if len(asked) == 2:  # the mesh that was scored is another one now
+            mesh = trimesh.load_mesh(chair).apply_scale((1, 1, 1.2))
+            mesh.export(tmp_path / "meshes" / "a.ply")
+    assert asked == [3, 3, 3, 2]
+
+
+def scores_of(**best):
+    """Scores of meshes that fit one pair of axes clearly, by name."""
+    pairs = [("y", "z"), ("y", "x"), ("z", "-y")]
+    return {
+        name: {pair: -0.3 - 0.1 * (pair != own) for pair in pairs} for name, own in best.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("fronts", "lying", "said"),
+    [
+        ("xxxz", [], "3 of 4 meshes that were looked at seem to face another way, 'a' for one; "
+         "give --up y --front x."),
+        ("zzzx", [], "1 of 4 meshes that were looked at seem to face another way than the rest: d"),
+        ("zzzz", ["c"], "1 of 4 meshes seem to lie on their side, if they are seats: c; --axes "),
+        ("zzzz", [], ""),
+    ],
+)  # fmt: skip
+def test_a_collection_votes_on_its_axes(monkeypatch, fronts, lying, said):
+    sources = [MeshSource(name, f"/{name}.obj") for name in "abcd"]
+    scores = scores_of(**{name: ("y", front) for name, front in zip("abcd", fronts, strict=True)})
+    warned = []
+    monkeypatch.setattr(collections, "_scores", lambda *_, **__: scores)
+    monkeypatch.setattr(collections, "warn", warned.append)
+    collections.check_axes(sources, lying, Axes())
+    assert len(warned) == bool(said) and said in "".join(warned)
+
+
+def test_each_mesh_gets_its_own_axes_where_they_are_asked_for(monkeypatch):
+    sources = [MeshSource(name, f"/{name}.obj") for name in "abc"]
+    scores = scores_of(a=("z", "-y"), b=("z", "-y"), c=("y", "z"))
+    monkeypatch.setattr(collections, "_scores", lambda *_, **__: scores)
+    assert collections.turned(sources, Axes()) == sources
+    axes = [source.axes for source in collections.turned(sources, Axes(axes="auto"))]
+    assert axes == [("z", "-y"), ("z", "-y"), ("y", "z")]
+
+
+def test_reasons_come_in_a_table(monkeypatch):
+    written = io.StringIO()
+    monkeypatch.setattr(common, "console", Console(file=written, width=200))
+    skipped = [Skipped(f"m{i}", "unreadable", "It is cut.") for i in range(5)]
+    common.report_skipped([*skipped, Skipped("x", "flat", "One axis.")])
+    common.report_notes([("m1", "collider left out: 'UCX_a'."), ("m2", "collider left out: 'b'.")])
+    assert written.getvalue().splitlines() == [
+        "skipped 5 unreadable: m0, m1, m2 and 2 more. m0: It is cut.",
+        "skipped 1 flat: x. One axis.",
+        "left out collider of 2 meshes: m1, m2. m1: collider left out: 'UCX_a'.",
+    ]
 
 
 # --- training ---------------------------------------------------------------------------------
@@ -622,7 +682,7 @@ def collection(tmp_path, monkeypatch, prior):
     def paths(mesh, config, seed):
         random = np.random.default_rng(seed)
         surfaces = random.integers(0, 256, (config.paths, 4096), np.uint8)
-        return surfaces, np.zeros((config.paths, len(config.frames), 32**3), np.uint8)
+        return surfaces, np.full((config.paths, len(config.frames), 32**3), 240, np.uint8)
 
     def train(folder, data, config, start=None):
         done = [report.step for report in training.read_metrics(folder)]
@@ -638,9 +698,9 @@ def collection(tmp_path, monkeypatch, prior):
         one = {method: scores for method in config.methods} | {"bounds": bounds}
         for model in models:
             frames = {str(k): one for k in config.frames}
-            yield {"name": model.name, "metadata": {}, "frames": frames}
+            yield {"name": model.name, "content": model.digest, "metadata": {}, "frames": frames}
 
-    monkeypatch.setattr(dataset, "ProcessPoolExecutor", lambda n, mp_context: ThreadPoolExecutor(n))
+    monkeypatch.setattr(building, "in_processes", lambda f, items, _: enumerate(map(f, items)))
     monkeypatch.setattr(dataset, "object_paths", paths)
     monkeypatch.setattr(training, "train", train)
     monkeypatch.setattr(training, "finished_prior", lambda *_: prior)
@@ -658,7 +718,7 @@ def killed_after(function, count):
     return part
 
 
-STAGES = ((dataset, "build_dataset"), (training, "train"), (evaluation, "evaluate"))
+STAGES = ((building, "build_dataset"), (training, "train"), (evaluation, "evaluate"))
 
 
 def test_own_category_in_one_command_however_often_it_is_killed(
@@ -682,8 +742,10 @@ def test_own_category_in_one_command_however_often_it_is_killed(
         assert not (output / "box.md").exists()
     status, out, err = run(*command)
     assert status == 0, err
+    sources = list_meshes(collection)
     training_set, held_out = (
-        {source.name for source in part} for part in hold_out(list_meshes(collection))
+        {source.name for source in part}
+        for part in hold_out([look(source, up="y", front="z", unit="m") for source in sources])
     )
     assert trained == 3 * [sorted(training_set - {"empty"})]
     content = json.loads((output / "evaluation.json").read_text())

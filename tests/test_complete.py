@@ -31,6 +31,8 @@ def test_complete_writes_a_mesh_where_the_cloud_lies(run, scan, tmp_path, linear
     for name in ("mesh.ply", "mesh.glb", "result.json", "overview.png", "report.html"):
         assert (tmp_path / "out" / name).stat().st_size > 0
     result = json.loads((tmp_path / "out/result.json").read_text())
+    assert result["quality"]["explained"] > 0.9 and 0.3 < result["quality"]["measured"] < 0.9
+    assert f"verdict: {result['verdict']}" in out and result["verdict"] != "failed"
     assert result["points"] == 5000 and result["up"] == "z" and result["metres_in_a_unit"] == 1
     points = np.asarray(trimesh.load(scan).vertices)
     mesh = trimesh.load(tmp_path / "out/mesh.ply")

@@ -33,8 +33,8 @@ def as_process(run, linear_weights, monkeypatch, tmp_path):
                 if number == killed_after:
                     raise OSError("killed.")
                 asked.append(model.name)
-                scores = {"iou": len(model.name), "bounds": {"occluded_empty": 1.0}}
-                frames = {"1": dict.fromkeys(config.methods, {"iou": 0.5}) | {"bounds": scores}}
+                scores = dict.fromkeys(config.methods, {"iou": float(len(model.name))})
+                frames = {"1": scores | {"bounds": {"occluded_empty": 1.0}}}
                 yield {"name": model.name, "metadata": {}, "frames": frames}
 
         monkeypatch.setattr(evaluation, "evaluate", evaluate)

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxshape import reading
 from jaxshape.bench.config import LADDER, LEFT
 from jaxshape.bench.machine import describe_machine, load
 from jaxshape.bench.problem_set import NAME, SHA256
@@ -118,10 +119,10 @@ def read_entry(path: Path) -> Entry:
         ValueError: The file is no entry.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = reading.read_json(path)
         machines, rows = content.pop("machines"), content.pop("rows")
         is_entry = content["format"] == FORMAT and isinstance(content["name"], str)
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         is_entry = False
     if not is_entry:
         raise ValueError(f"{str(path)!r} is no entry of the benchmark ({FORMAT}).")

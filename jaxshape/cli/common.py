@@ -1,5 +1,6 @@
 """Parts that all commands share: the console, progress, and the refusal of bad input."""
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -37,7 +38,36 @@ def progress_bar(unit: str) -> Progress:
     )
 
 
-def report_skipped(skipped: Any) -> None:
-    """Say which meshes (`Skipped`) are left out, and why."""
+NAMED = 3
+"""Meshes that are named for each reason."""
+
+
+def report_skipped(skipped: Iterable[Any]) -> None:
+    """Say how many meshes (`Skipped`) are left out for each reason, with the first of them."""
+    reasons: dict[str, list[Any]] = {}
     for one in skipped:
-        console.print(f"[yellow]skipped[/] {escape(one.name)}: {one.reason}. {escape(one.detail)}")
+        reasons.setdefault(one.reason, []).append(one)
+    for reason, those in sorted(reasons.items(), key=lambda entry: -len(entry[1])):
+        _report("skipped", f"{len(those)} {reason}", [one.name for one in those], those[0].detail)
+
+
+def report_notes(notes: Iterable[tuple[str, str]]) -> None:
+    """Say what files hold besides the object: names of meshes, and notes as of `Model`."""
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for name, note in notes:
+        kinds.setdefault(note.partition(" left out")[0], []).append((name, note))
+    for kind, those in kinds.items():
+        of = f"{kind} of {len(those)} meshes"
+        _report("left out", of, [name for name, _ in those], those[0][1])
+
+
+def named(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _report(what: str, which: str, names: list[str], example: str) -> None:
+    first = f"{names[0]}: " if len(names) > 1 else ""
+    text = escape(f"{which}: {named(names)}. {first}{example}")
+    console.print(f"[yellow]{what}[/] {text}", highlight=False, soft_wrap=True)

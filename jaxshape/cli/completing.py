@@ -1,5 +1,6 @@
 """`jaxshape complete`: one object from a point cloud or a fused model."""
 
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +53,7 @@ class Complete(Rebuild):
         from jaxshape.mapping.placement.cloud_placing import cloud_grids, place_cloud
         from jaxshape.mapping.tracking.keyframes import place_of
         from jaxshape.results.output import Observation
+        from jaxshape.results.summary import verdict_in_words
         from jaxshape.search.reconstruction import require_measured
 
         cloud = read_cloud(self.scan, seed=self.seed)
@@ -78,6 +80,7 @@ class Complete(Rebuild):
             frame=frame,
             T_world_object=np.diag([1 / placed.metres] * 3 + [1.0]) @ T,
             truth=None,
+            cloud=(placed.metres * np.asarray(cloud.points, np.float64) - T[:3, 3]) @ T[:3, :3],
         )
         figures: dict[str, Any] = {"object": str(self.scan), **self.settings(prior, "points")}
         figures |= {"points": len(cloud.points), "up": placed.up, "metres_in_a_unit": placed.metres}
@@ -87,7 +90,10 @@ class Complete(Rebuild):
         size = " x ".join(f"{extent:.2f}" for extent in placed.box.size)
         print(f"{len(cloud.points)} points of an object of {size} m, {placed.up} is up")
         report_objective(result)
+        print(verdict_in_words(result))
         print(f"wrote mesh.glb, mesh.ply, result.json, overview.png, report.html to {self.output}")
+        if result["verdict"] == "failed":
+            sys.exit(3)
 
 
 def _of_rays(cloud: Any) -> list[str]:

@@ -20,6 +20,7 @@ LayoutName = Literal[
     "record3d",
     "scannet",
     "replica",
+    "icl-nuim",
     "npz",
     "redwood",
     "bundlesdf",
@@ -50,8 +51,8 @@ class Inspect:
 
     frames: Positional[Path]
     """Folder of the recording: 7-Scenes, TUM RGB-D, ScanNet, BOP, WildRGB-D, Redwood, Replica,
-    Open3D, Stray Scanner, Record3D, nerfstudio, or rgb/ depth/ masks/ with cam_K.txt; or an .npz
-    file of arrays."""
+    ICL-NUIM, Open3D, Stray Scanner, Record3D, nerfstudio, or rgb/ depth/ masks/ with cam_K.txt; or
+    an .npz file of arrays."""
     depth_scale: float | None = None
     """Depth units in a metre, above 0; those of the layout by default."""
     layout: LayoutName | None = None

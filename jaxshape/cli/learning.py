@@ -14,9 +14,17 @@ import tyro
 
 from jaxshape import checks, limits
 from jaxshape.claim import Output
-from jaxshape.cli.common import console, progress_bar, report_skipped, require
-from jaxshape.cli.options import Axes, Machines
-from jaxshape.cli.scoring import load_models, score
+from jaxshape.cli.collection import (
+    SAMPLE,
+    check_axes,
+    find_meshes,
+    load_models,
+    look_at,
+    turned,
+)
+from jaxshape.cli.common import console, progress_bar, report_notes, report_skipped, require
+from jaxshape.cli.options import Axes, AxesName, Machines
+from jaxshape.cli.scoring import score
 from jaxshape.data.config import DatasetConfig, FamilyName
 from jaxshape.files import write_json, write_text
 from jaxshape.model.config import TrainConfig
@@ -57,6 +65,9 @@ class BuildDataset:
     preset: Preset = "default"
     """Defaults of the options below: the best that we found, or the paper's 18 clean single views,
     which `jaxshape dataset --preset paper --help` shows."""
+    axes: AxesName = "given"
+    """`given` takes --up and --front for all meshes, and warns where they seem wrong; `auto` turns
+    each seat upright and forward."""
     config: tyro.conf.OmitArgPrefixes[DatasetConfig] = DatasetConfig()
     workers: int = PROCESSORS
     """Processes that work at the same time, 1 to 256."""
@@ -84,28 +95,40 @@ class BuildDataset:
         return whole - sum(path.stat().st_size for path in self.folder.glob("shard-*.npy"))
 
     def run(self) -> None:
-        from jaxshape.data.archives import list_meshes
         from jaxshape.data.families import TEST_SEEDS, procedural_objects
 
         require(1 <= self.count <= TEST_SEEDS, f"--count is {self.count}; give 1 to 1000000.")
         objects: Sequence[Any] = (
-            list_meshes(self.meshes) if self.meshes else procedural_objects(self.family, self.count)
+            self.find(self.meshes) if self.meshes else procedural_objects(self.family, self.count)
         )
         build(self.folder, objects, self.config, self.workers)
+
+    def find(self, meshes: Path) -> Sequence[Any]:
+        """The meshes, of which some are looked at for their unit and their axes."""
+        from jaxshape.data.survey import evenly
+
+        config = self.config
+        axes = Axes(up=config.up, front=config.front, axes=self.axes, unit=config.unit)
+        sources = find_meshes(meshes)
+        usable = [one for one in look_at(evenly(sources, SAMPLE), axes) if one.skipped is None]
+        lying = [one.source.name for one in usable if one.lies]
+        check_axes([one.source for one in usable], lying, axes)
+        return turned(sources, axes)
 
 
 def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: int) -> None:
     """Build a dataset, or what is missing of it, with a bar."""
-    from jaxshape.data.dataset import build_dataset
+    from jaxshape.data import building
 
-    skipped = []
+    skipped, notes = [], []
     with progress_bar("objects") as bar:
         task = bar.add_task("dataset", total=len(objects), note="")
-        for done in build_dataset(folder, objects, config, workers=workers):
-            skipped = done.skipped
+        for done in building.build_dataset(folder, objects, config, workers=workers):
+            skipped, notes = done.skipped, done.notes
             note = f"{len(skipped)} skipped" if skipped else ""
             bar.update(task, completed=done.objects, note=note)
     report_skipped(skipped)
+    report_notes(notes)
     require(
         len(skipped) < len(objects),
         f"None of the {len(objects)} meshes could be used; see the reasons above.",
@@ -215,7 +238,6 @@ class Train:
         """The folder of a dataset of --meshes; the models kept out of it, and those skipped."""
         import jax
 
-        from jaxshape.data.archives import list_meshes
         from jaxshape.data.split import hold_out
 
         assert self.meshes is not None
@@ -224,12 +246,18 @@ class Train:
             "Several processes cannot build one dataset; make it first with jaxshape dataset "
             "--meshes, and give its folder as --dataset.",
         )
-        training, held_out = hold_out(list_meshes(self.meshes))
+        sources = turned(find_meshes(self.meshes), self.axes)
+        found = look_at(sources, self.axes)
+        usable = [one for one in found if one.skipped is None]
+        training, held_out = hold_out(found)
+        lying = [one.source.name for one in usable if one.lies]
+        check_axes([one.source for one in usable], lying, self.axes)
         models = load_models(held_out, self.axes)  # refused now, not after hours of training
         config = replace(
             OWN_MESHES,
             up=self.axes.up,
             front=self.axes.front,
+            unit=self.axes.unit,
             resolution=self.config.architecture.resolution,
             seed=self.config.seed,
         )

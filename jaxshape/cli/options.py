@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import wraps
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
@@ -12,18 +12,25 @@ from jaxshape import process
 from jaxshape.checks import BadSetting
 from jaxshape.cli.common import require
 from jaxshape.data.camera_config import CameraConfig
-from jaxshape.data.config import Axis, CameraName, check_axes
+from jaxshape.data.config import Axis, CameraName, UnitName, check_axes
 from jaxshape.geometry.config import FusionName
+
+AxesName = Literal["given", "auto"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axes:
-    """Orientation of the files of --meshes."""
+    """Orientation and unit of the files of --meshes."""
 
     up: Axis = "y"
     """Axis of the meshes that points up."""
     front: Axis = "z"
     """Axis of the meshes along which the object's front looks; perpendicular to --up."""
+    axes: AxesName = "given"
+    """`given` takes --up and --front for all meshes, and warns where they seem wrong; `auto` turns
+    each mesh upright and forward, as far as the weights for chairs know its kind."""
+    unit: UnitName = "m"
+    """Unit of the meshes: metres, centimetres, millimetres or inches."""
 
     def __post_init__(self) -> None:
         check_axes(self.up, self.front)

@@ -1,7 +1,6 @@
 """`jaxshape evaluate` and `jaxshape plot`: how good results are, and how a search went."""
 
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from jaxshape.claim import Output
+from jaxshape.cli.collection import check_axes, find_meshes, load_models, turned
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Machines, Seen, checked_numbers
 from jaxshape.data.config import FamilyName
@@ -63,7 +63,6 @@ class Evaluate:
         self.machines.join(patience=PATIENCE)
         import jax
 
-        from jaxshape.data.archives import list_meshes
         from jaxshape.data.families import TEST_SEEDS, procedural_objects
         from jaxshape.model.weights import load_prior, packaged_for
         from jaxshape.results import evaluation
@@ -82,59 +81,33 @@ class Evaluate:
             "Give either --meshes PATH or --count NUMBER, to say what to evaluate on.",
         )
         procedural = procedural_objects(self.family, self.count, TEST_SEEDS)
-        sources = list_meshes(self.meshes) if self.meshes else procedural
+        sources: Any = find_meshes(self.meshes) if self.meshes else procedural
         packaged = packaged_for(self.family)
         prior = load_prior(self.weights or packaged)
         evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
         share = Share(jax.process_index(), jax.process_count())
-        models, skipped = load_models(share.of(sources), self.axes, refuse=share.count == 1)
-        if self.family == "chair":
-            _check_upright(models, refuse=self.weights is None)
+        names = [source.name for source in sources]
+        mine = share.of(sources)
+        if self.meshes:
+            mine = turned(mine, self.axes, prior)
+        models, skipped = load_models(mine, self.axes, refuse=share.count == 1)
+        if self.meshes and self.family == "chair":
+            self.check(mine, models, prior)
         about = {
             "meshes": str(self.meshes or f"{self.count} procedural {self.family}s"),
             **asdict(self.axes),
             "weights": str(self.weights) if self.weights else f"{packaged} (packaged)",
         }
-        names = [source.name for source in sources]
         score(self.output, prior, config, about, models, skipped, names, share)
 
+    def check(self, sources: Sequence[Any], models: Sequence[Any], prior: Any) -> None:
+        """Refuse seats that lie on their side, and warn of those that face another way."""
+        from jaxshape.data.meshes import lying_on_its_side
 
-def load_models(
-    sources: Sequence[Any], axes: Axes, *, refuse: bool = True
-) -> tuple[list[Any], list[Any]]:
-    """The meshes (`Model`) that can be used, and those `Skipped`; it may refuse to use none."""
-    from jaxshape.data.dataset import load_object
-    from jaxshape.data.meshes import Skipped
-
-    with progress_bar("meshes") as bar:
-        task = bar.add_task("read", note="")
-        watched = bar.track(sources, task_id=task)
-        found = [load_object(source, up=axes.up, front=axes.front) for source in watched]
-    skipped = [f for f in found if isinstance(f, Skipped)]
-    models = [f for f in found if not isinstance(f, Skipped)]
-    report_skipped(skipped)
-    require(
-        bool(models) or not refuse,
-        f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
-        f"{skipped[0].reason}. {skipped[0].detail}"
-        if skipped
-        else "",
-    )
-    return models, skipped
-
-
-def _check_upright(models: Sequence[Any], *, refuse: bool) -> None:
-    """Refuse a set of seats that seems to lie on its side; other weights may be of other things."""
-    from jaxshape.data.meshes import lying_on_its_side
-
-    lying = [model.name for model in models if lying_on_its_side(model.mesh)]
-    if 2 * len(lying) > len(models):
-        complaint = (
-            f"{len(lying)} of {len(models)} meshes seem to lie on their side, {lying[0]!r} for "
-            "one{}; name the axis that points up, for example --up z --front -y."
-        )
-        require(not refuse, complaint.format(""))
-        warnings.warn(complaint.format(", if they are seats"), stacklevel=2)
+        lying = [model.name for model in models if lying_on_its_side(model.mesh)]
+        usable = {model.name for model in models}
+        kept = [source for source in sources if source.name in usable]
+        check_axes(kept, lying, self.axes, prior=prior, refuse=self.weights is None)
 
 
 def score(
@@ -165,9 +138,12 @@ def score(
     settings = asdict(config) | resolved | about
     stamp = settings | {"fingerprint": fingerprint(prior)}
     names = [one.name for one in (*models, *skipped)] if names is None else names
+    for earlier in journals_of(output, stamp):  # of files that have changed since
+        earlier.forget({model.name: model.digest for model in models})
     journal = (share or Share()).journal(output, stamp)
     scored = {name for name, row in _rows(output, stamp).items() if "skipped" not in row}
     left = [model for model in models if model.name not in scored]
+    unseen = []
     if skipped:
         journal.add({one.name: {"skipped": one._asdict()} for one in skipped}, 0.0)
     with progress_bar("meshes") as bar:
@@ -175,13 +151,14 @@ def score(
         task = bar.add_task("evaluate", total=len(models), completed=completed, note="")
         for scores in evaluation.evaluate(prior, left, config):
             if isinstance(scores, Skipped):
-                report_skipped([scores])
+                unseen.append(scores)
                 row = {scores.name: {"skipped": scores._asdict()}}
             else:
                 row = {scores["name"]: scores}
             journal.add(row, time.perf_counter() - start)
             start = time.perf_counter()
             bar.update(task, advance=1)
+    report_skipped(unseen)
     seconds, rows = sum(one.seconds for one in journals_of(output, stamp)), _rows(output, stamp)
     if missing := [name for name in names if name not in rows]:
         print(

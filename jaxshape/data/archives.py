@@ -10,6 +10,7 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -19,6 +20,13 @@ from jaxshape.limits import MESH_BYTES
 
 MESH_SUFFIXES = (".obj", ".off", ".ply", ".glb", ".gltf", ".stl")
 ARCHIVE_SUFFIXES = (".zip", ".sh3f")
+
+UNREAD_SUFFIXES = (
+    ".3ds", ".3mf", ".7z", ".abc", ".blend", ".c4d", ".dae", ".dxf", ".fbx", ".gz", ".iges", ".igs",
+    ".lwo", ".ma", ".max", ".mb", ".rar", ".skp", ".step", ".stp", ".tar", ".tgz", ".usd", ".usda",
+    ".usdc", ".usdz", ".vrml", ".wrl", ".x", ".x3d", ".xz",
+)  # fmt: skip
+"""Suffixes of meshes and archives that are not read, and are counted where they are met."""
 
 MAX_BYTES = MESH_BYTES
 """Largest file or inflated archive member that is read."""
@@ -41,12 +49,15 @@ class MeshSource(NamedTuple):
         member: Name of the member inside the archive; None for a file of its own.
         metadata: Entries of a furniture catalogue for the mesh, under the catalogue's own field
             names; else empty.
+        axes: Axes of this file that point up and to the front, as ("z", "-y"); None where they are
+            those of its collection.
     """
 
     name: str
     path: str
     member: str | None = None
     metadata: dict[str, str] = {}  # noqa: RUF012 - never written to
+    axes: tuple[str, str] | None = None
 
 
 class TooLarge(ValueError):
@@ -57,8 +68,9 @@ def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
     """List every mesh at a path, in the order of their names, without loading any.
 
     Folders are searched recursively for meshes and archives, as ShapeNet and ModelNet trees are;
-    symbolic links to folders are not followed, and hidden files are left out. An archive that
-    cannot be opened is listed under its own name, so that loading it reports why.
+    symbolic links to folders are not followed, and hidden files are left out (`passed_over` counts
+    what might have been meshes). An archive or a folder that cannot be opened is listed under its
+    own name, so that loading it reports why.
 
     Args:
         path: A mesh, an archive (`.zip`, or Sweet Home 3D's `.sh3f`), or a folder of both.
@@ -70,10 +82,12 @@ def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
     root = Path(path)
     if not root.exists():
         raise FileNotFoundError(f"There is no file or folder {str(root)!r} to read meshes from.")
-    files = _walk(root) if root.is_dir() else [root]
+    walked = _walk(root) if root.is_dir() else _Walked([root], [], 0)
     folder = root if root.is_dir() else root.parent
     found: list[tuple[str, MeshSource]] = []
-    for file in files:
+    for closed in walked.closed:
+        found.append((closed.relative_to(folder).as_posix(), MeshSource("", str(closed))))
+    for file in walked.files:
         inside = file.relative_to(folder).as_posix()
         if file.suffix.lower() in MESH_SUFFIXES:
             found.append((inside, MeshSource("", str(file))))
@@ -88,11 +102,47 @@ def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
     return _named(found)
 
 
-def _walk(folder: Path) -> list[Path]:
-    files = []
-    for parent, _, names in os.walk(folder):
+class _Walked(NamedTuple):
+    """What a folder holds.
+
+    Attributes:
+        files: All files that are not hidden.
+        closed: Folders that cannot be opened.
+        links: Number of links to folders, which are not followed.
+    """
+
+    files: list[Path]
+    closed: list[Path]
+    links: int
+
+
+def _walk(folder: Path) -> _Walked:
+    files, closed, links = [], [], 0
+
+    def refuse(problem: OSError) -> None:
+        closed.append(Path(problem.filename or folder))
+
+    for parent, inside, names in os.walk(folder, onerror=refuse):
         files += [Path(parent, name) for name in names]
-    return sorted(file for file in files if not _hidden(file.relative_to(folder).as_posix()))
+        links += sum(os.path.islink(Path(parent, name)) for name in inside)
+    shown = sorted(file for file in files if not _hidden(file.relative_to(folder).as_posix()))
+    return _Walked(shown, sorted(closed), links)
+
+
+def passed_over(path: str | os.PathLike[str]) -> Counter[str]:
+    """What a folder holds that may be meshes, but is not read: how often each suffix comes.
+
+    Args:
+        path: A folder; nothing is passed over in a file.
+    """
+    if not Path(path).is_dir():
+        return Counter()
+    walked = _walk(Path(path))
+    suffixes = (file.suffix.lower() for file in walked.files)
+    found = Counter(suffix for suffix in suffixes if suffix in UNREAD_SUFFIXES)
+    if walked.links:
+        found["linked folders"] = walked.links
+    return found
 
 
 def _hidden(path: str) -> bool:
@@ -117,7 +167,7 @@ def _list_archive(file: Path, prefix: str) -> list[tuple[str, MeshSource]]:
 
 def _named(found: list[tuple[str, MeshSource]]) -> list[MeshSource]:
     """Name each source by its path, without suffixes unless another would have the same name."""
-    paths = [_safe(path) for path, _ in found]
+    paths = [printable(_safe(path)) for path, _ in found]
     stems = [re.sub(rf"(?i)({_SUFFIX})(?=/|$)", "", path) for path in paths]
     shared = Counter(stems)
     seen: Counter[str] = Counter()
@@ -127,6 +177,16 @@ def _named(found: list[tuple[str, MeshSource]]) -> list[MeshSource]:
         seen[name] += 1  # members of one archive may even have equal paths, once made safe
         sources.append(source._replace(name=name if seen[name] == 1 else f"{name}~{seen[name]}"))
     return sorted(sources, key=lambda source: source.name)
+
+
+def printable(name: str) -> str:
+    """A name of a file whose bytes that are no UTF-8 are written as `\\xe9`, so that any text file
+    and any console can hold it.
+
+    Args:
+        name: A name or path, as Python gives it.
+    """
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _safe(path: str) -> str:
@@ -177,6 +237,9 @@ def read_bytes(source: MeshSource, beside: str | None = None) -> bytes:
         TooLarge: The file is larger than `MAX_BYTES`.
     """
     path = Path(source.path)
+    if path.is_dir():
+        os.listdir(path)  # says why a folder that was listed cannot be read
+        raise IsADirectoryError(f"{printable(path.name)!r} could not be opened as a folder.")
     if source.member is None and path.suffix.lower() in ARCHIVE_SUFFIXES:
         raise zipfile.BadZipFile(f"{path.name} is not a readable zip archive.")
     if source.member is None:
@@ -185,11 +248,18 @@ def read_bytes(source: MeshSource, beside: str | None = None) -> bytes:
             raise FileNotFoundError(f"There is no file {file.name!r} beside the mesh.")
         with open(file, "rb") as stream:
             return _read(stream.read, file.name)
-    with zipfile.ZipFile(path) as archive:
-        member = source.member
-        if beside is not None:
-            member = _below(posixpath.join(posixpath.dirname(member), beside))
-        return _read_member(archive, member)
+    member = source.member
+    if beside is not None:
+        member = _below(posixpath.join(posixpath.dirname(member), beside))
+    about = path.stat()
+    return _read_member(_archive(source.path, about.st_mtime_ns, about.st_size), member)
+
+
+@lru_cache(maxsize=4)
+def _archive(path: str, modified: int, size: int) -> zipfile.ZipFile:
+    """An open archive; listing the members of a large one anew for each of them takes minutes."""
+    del modified, size  # another file at the same path is opened anew
+    return zipfile.ZipFile(path)
 
 
 def _read_member(archive: zipfile.ZipFile, member: str) -> bytes:

@@ -10,7 +10,8 @@ import trimesh
 from jaxtyping import Float
 
 from jaxshape.data.archives import Beside, MeshSource, read_bytes
-from jaxshape.data.meshes import MAX_FACES, sample_oriented
+from jaxshape.data.formats.parts import MAX_FACES
+from jaxshape.data.meshes import sample_oriented
 from jaxshape.data.pcd import parse_pcd
 
 SUFFIXES = (".ply", ".pcd")

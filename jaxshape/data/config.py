@@ -17,6 +17,14 @@ FamilyName = Literal["chair", "table"]
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
+UpFront = tuple[str, str]
+"""Axes of a mesh that point up and to the front, as ("z", "-y")."""
+
+UnitName = Literal["m", "cm", "mm", "inch"]
+
+UNITS: dict[UnitName, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+"""Metres in each unit of mesh files."""
+
 
 def check_axes(up: str, front: str) -> None:
     """Refuse axes that do not describe the orientation of an object.
@@ -87,6 +95,7 @@ class DatasetConfig:
         faults: How often frames go wrong.
         up: Axis of the mesh files that points up.
         front: Axis of the mesh files along which the object's front looks.
+        unit: Unit of the mesh files: "m", "cm", "mm" or "inch".
         resolution: Voxels along each axis of the grids: 8, 16, 32, 64 or 128 (paper: 32).
         seed: Seed of all draws, 0 or more.
 
@@ -102,6 +111,7 @@ class DatasetConfig:
     faults: FaultConfig = FaultConfig()
     up: Axis = "y"
     front: Axis = "z"
+    unit: UnitName = "m"
     resolution: int = 32
     seed: int = 0
 
@@ -119,6 +129,7 @@ class DatasetConfig:
         checks.within("noisy", self.noisy, 0, 1)
         checks.within("arcs", self.arcs, 0, 1)
         check_axes(self.up, self.front)
+        checks.one_of("unit", self.unit, UNITS)
         checks.seed("seed", self.seed)
 
 

@@ -4,18 +4,13 @@ A dataset is a folder of shards of up to `OBJECTS_PER_SHARD` objects. Of each ob
 the complete surface **Y** along each camera path, in bit-packed grids `[object path bytes]`, and
 what was measured after each number of frames, `[object path number voxels]`: one byte for each
 voxel, of which 4 bits are the probability of surface and 4 that of free space, in fifteenths. A
-`.json` beside it names the objects and what was skipped; it comes last, so that a killed build goes
-on where it stopped, and a finished one has nothing left to do.
+`.json` beside it names the objects, what was skipped, and the content of the files.
+
+`building` makes datasets; here is what one object becomes, and how a finished dataset is read.
 """
 
-import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,11 +21,10 @@ from jaxtyping import Bool, UInt8
 
 from jaxshape.data import meshes
 from jaxshape.data.archives import MeshSource
-from jaxshape.data.config import DatasetConfig
+from jaxshape.data.config import DatasetConfig, UnitName
 from jaxshape.data.families import Procedural
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.data.paths import draw_path
-from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.grids import Grids
 
 FORMAT = "jaxshape-dataset-2"
@@ -43,6 +37,9 @@ OBJECTS_PER_SHARD = 64
 STEPS = 15
 """Steps of the probabilities of what was measured, which have 4 bits each."""
 
+ATTEMPTS = 3
+"""How often a path is drawn along which nothing is measured."""
+
 Object = Procedural | MeshSource
 """An object of a dataset: a procedural one, or a mesh file."""
 
@@ -51,38 +48,39 @@ class DatasetError(ValueError):
     """A dataset folder cannot be read or continued."""
 
 
-class BuildProgress(NamedTuple):
-    """Progress of a build.
-
-    Attributes:
-        objects: Objects that are done, skipped ones included.
-        total: Objects in all.
-        skipped: Objects that could not be used.
-    """
-
-    objects: int
-    total: int
-    skipped: list[Skipped]
-
-
 # ------------------------------------------------------------------ one object
 
 
-def load_object(item: Object, *, up: str = "y", front: str = "z") -> Model | Skipped:
+def load_object(
+    item: Object, *, up: str = "y", front: str = "z", unit: UnitName = "m"
+) -> Model | Skipped:
     """Make or read one object in the canonical frame."""
     if isinstance(item, MeshSource):
-        return meshes.load(item, up=up, front=front)
+        return meshes.load(item, up=up, front=front, unit=unit)
     return Model(item.name, item.make(), {})
 
 
 def object_paths(
     mesh: trimesh.Trimesh, config: DatasetConfig, seed: int
-) -> tuple[UInt8[np.ndarray, "path bytes"], UInt8[np.ndarray, "path number voxels"]]:
-    """The complete surface of one object and what was measured of it along each path, packed."""
-    paths = [draw_path(mesh, config, hash_seed(seed, i)) for i in range(config.paths)]
-    surfaces = np.stack([np.asarray(path.surface) for path in paths])
-    measured = np.stack([pack_measured(jax.device_get(path.measured)) for path in paths])
-    return pack(surfaces), measured
+) -> tuple[UInt8[np.ndarray, "path bytes"], UInt8[np.ndarray, "path number voxels"]] | None:
+    """The complete surface of one object and what was measured of it along each path, packed; None
+    where a camera measures nothing of it along a whole path, however often that is drawn."""
+    drawn = [_drawn(mesh, config, (seed, i)) for i in range(config.paths)]
+    paths = [path for path in drawn if path is not None]
+    if len(paths) < len(drawn):
+        return None
+    return pack(np.stack([surface for surface, _ in paths])), np.stack([m for _, m in paths])
+
+
+def _drawn(
+    mesh: trimesh.Trimesh, config: DatasetConfig, seed: tuple[int, int]
+) -> tuple[Bool[np.ndarray, "x y z"], UInt8[np.ndarray, "number voxels"]] | None:
+    for attempt in range(ATTEMPTS):
+        path = draw_path(mesh, config, hash_seed(*seed, *[attempt] * (attempt > 0)))
+        measured = pack_measured(jax.device_get(path.measured))
+        if (measured[-1] > STEPS).any():  # after all its frames, some voxel may be surface
+            return np.asarray(path.surface), measured
+    return None
 
 
 def pack_measured(grids: Grids) -> UInt8[np.ndarray, "*batch voxels"]:
@@ -118,101 +116,20 @@ def _side(packed: UInt8[np.ndarray, "*batch bytes"]) -> int:
     return round((8 * packed.shape[-1]) ** (1 / 3))
 
 
-# ------------------------------------------------------------------ writing
-
-
-def build_dataset(
-    folder: str | os.PathLike[str],
-    objects: Sequence[Object],
-    config: DatasetConfig = DatasetConfig(),
-    *,
-    workers: int | None = None,
-) -> Iterator[BuildProgress]:
-    """Write the missing shards of a dataset in parallel processes.
-
-    Args:
-        folder: Folder of the dataset; made if missing.
-        objects: Procedural objects, or meshes.
-        config: Settings of the dataset.
-        workers: Processes, 1 or more; None for one for each CPU core.
-
-    Yields:
-        The progress, at first and after each shard.
-
-    Raises:
-        DatasetError: The folder holds a dataset of other objects or settings.
-    """
-    folder = Path(folder)
-    _claim(folder, objects, config)
-    starts = range(0, len(objects), OBJECTS_PER_SHARD)
-    shards = [(n, objects[s : s + OBJECTS_PER_SHARD]) for n, s in enumerate(starts)]
-    missing = [shard for shard in shards if not _shard_path(folder, shard[0], "json").exists()]
-    done = sum(len(items) for _, items in shards) - sum(len(items) for _, items in missing)
-    skipped = [s for n, _ in shards if (n, _) not in missing for s in _read_names(folder, n)[1]]
-    yield BuildProgress(done, len(objects), skipped)
-    if not missing:
-        return
-    write = partial(_write_shard, folder, config)
-    workers = min(workers or os.cpu_count() or 1, len(missing))
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(write, *shard): shard for shard in missing}
-        for future in as_completed(futures):
-            skipped = skipped + future.result()
-            done += len(futures[future][1])
-            yield BuildProgress(done, len(objects), skipped)
-
-
-def _write_shard(
-    folder: Path, config: DatasetConfig, number: int, items: Sequence[Object]
-) -> list[Skipped]:
-    names, made, skipped = [], [], []
-    for i, item in enumerate(items):
-        model = load_object(item, up=config.up, front=config.front)
-        if isinstance(model, Skipped):
-            skipped.append(model)
-            continue
-        seed = hash_seed(config.seed, number * OBJECTS_PER_SHARD + i)
-        names.append(model.name)
-        made.append(object_paths(model.mesh, config, seed))
-    voxels = config.resolution**3
-    shapes = (config.paths, voxels // 8), (config.paths, len(config.frames), voxels)
-    for kind, shape, arrays in zip(KINDS, shapes, zip(*made, strict=True) if made else ((), ()),
-                                   strict=True):  # fmt: skip
-        with atomic_path(_shard_path(folder, number, f"{kind}.npy")) as path:
-            np.save(path, np.stack(arrays) if arrays else np.zeros((0, *shape), np.uint8))
-    # The names come last: a shard counts as written once they are there.
-    write_json(_shard_path(folder, number, "json"), {"names": names, "skipped": skipped})
-    return skipped
-
-
 def hash_seed(*numbers: int) -> int:
     """A seed below 2^31 for each tuple of numbers, unrelated between neighbours."""
     return int(np.random.SeedSequence(numbers).generate_state(1)[0] >> 1)
 
 
-def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> None:
-    names = [item.name for item in objects]
-    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
-    settings = json.loads(json.dumps(asdict(config)))
-    claim = {"format": FORMAT, "config": settings, "objects": len(names), "names_sha256": digest}
-    path = folder / "dataset.json"
-    if path.exists():
-        if json.loads(path.read_text()) != claim:
-            raise DatasetError(
-                f"{str(folder)!r} already holds a dataset of other objects or settings; "
-                "give another folder, or remove this one."
-            )
-        return
-    write_json(path, claim)
+def shard_path(folder: Path, number: int, suffix: str) -> Path:
+    """A file of a shard.
 
-
-def _shard_path(folder: Path, number: int, suffix: str) -> Path:
+    Args:
+        folder: Folder of the dataset.
+        number: Number of the shard, from 0.
+        suffix: "json", or a kind of array and "npy".
+    """
     return folder / f"shard-{number:05d}.{suffix}"
-
-
-def _read_names(folder: Path, number: int) -> tuple[list[str], list[Skipped]]:
-    content = json.loads(_shard_path(folder, number, "json").read_text())
-    return content["names"], [Skipped(*entry) for entry in content["skipped"]]
 
 
 # ------------------------------------------------------------------ reading
@@ -280,7 +197,7 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
         )
     count = claim["objects"]
     expected = -(-count // OBJECTS_PER_SHARD)
-    missing = [n for n in range(expected) if not _shard_path(folder, n, "json").exists()]
+    missing = [n for n in range(expected) if not shard_path(folder, n, "json").exists()]
     if missing:
         raise DatasetError(
             f"{len(missing)} of the {expected} shards of {str(folder)!r} are missing; "
@@ -289,11 +206,11 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     names, row = [], []
     arrays: dict[str, list[np.ndarray]] = {kind: [] for kind in KINDS}
     for number in range(expected):
-        inside = _read_names(folder, number)[0]
+        inside = json.loads(shard_path(folder, number, "json").read_text())["names"]
         names += inside
         row += [(number, place) for place in range(len(inside))]
         for kind in KINDS:
-            path = _shard_path(folder, number, f"{kind}.npy")
+            path = shard_path(folder, number, f"{kind}.npy")
             arrays[kind].append(np.load(path, mmap_mode="r"))
     if not names:
         raise DatasetError(f"Every object of the dataset in {str(folder)!r} was skipped.")

@@ -6,28 +6,28 @@
 `list_meshes` finds them without opening any, `load` opens one, so that processes can share them.
 """
 
-import io
+import hashlib
 import os
-import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from jaxshape import limits
-from jaxshape.data.archives import Beside, MeshSource, TooLarge, list_meshes, read_bytes
-from jaxshape.data.config import check_axes
-from jaxshape.data.orientation import apparent_up
+from jaxshape.data.archives import MeshSource, TooLarge, list_meshes, read_bytes
+from jaxshape.data.config import UNITS, UnitName, check_axes
+from jaxshape.data.formats import read_parts
+from jaxshape.data.formats.gltf_data import referred
+from jaxshape.data.formats.parts import NotSupported, TooManyFaces, Unreadable
+from jaxshape.data.helpers import without_helpers
+from jaxshape.data.orientation import SEAT, apparent_up, up_scores
 
 __all__ = [
     "MeshSource", "Model", "Skipped", "axes_to_canonical", "canonical", "list_meshes", "load",
     "lying_on_its_side", "read_meshes", "sample_oriented", "sample_surface",
 ]  # fmt: skip
-
-MAX_FACES = limits.MESH_FACES
-"""Most triangles of one mesh, counted over all its instances in a scene."""
 
 FLAT = 1e-6
 """An object is flat when its smallest extent is below this fraction of its largest."""
@@ -46,11 +46,15 @@ class Model(NamedTuple):
             units of the file (metres where the file is in metres, as glTF is, or where a catalogue
             gives sizes).
         metadata: Entries of a furniture catalogue: name, creator, license, and so on; else empty.
+        notes: Sentences on what the file holds besides the object, and was left out.
+        digest: Digest of the content of the file, and of what it refers to.
     """
 
     name: str
     mesh: trimesh.Trimesh
     metadata: dict[str, str]
+    notes: tuple[str, ...] = ()
+    digest: str = ""
 
 
 class Skipped(NamedTuple):
@@ -58,9 +62,9 @@ class Skipped(NamedTuple):
 
     Attributes:
         name: Identifier of the mesh, as in `Model`.
-        reason: One of `unreadable`, `too large`, `empty` (no vertices), `no faces` (none with an
-            area), `not finite`, `flat` (an axis with no extent), `nothing measured` (in an
-            evaluation).
+        reason: One of `unreadable`, `not supported` (a feature of the format), `too large`, `empty`
+            (no vertices), `no faces` (none with an area), `not finite`, `flat` (an axis with no
+            extent), `nothing measured` (by the virtual camera), `killed` (with its process).
         detail: A sentence on what is wrong.
     """
 
@@ -75,7 +79,7 @@ class _Unusable(ValueError):
 
 
 def read_meshes(
-    path: str | os.PathLike[str], *, up: str = "y", front: str = "z"
+    path: str | os.PathLike[str], *, up: str = "y", front: str = "z", unit: UnitName = "m"
 ) -> Iterator[Model | Skipped]:
     """Load every mesh at a path in turn, in the order of their names. [host]
 
@@ -84,6 +88,7 @@ def read_meshes(
             recursively.
         up: Axis of the files that points up: `x`, `y`, `z`, or one of these with a minus.
         front: Axis of the files along which the object's front looks, perpendicular to `up`.
+        unit: Unit of the files: "m", "cm", "mm" or "inch".
 
     Returns:
         An iterator over the meshes: a `Model`, or `Skipped` where one cannot be used.
@@ -94,19 +99,24 @@ def read_meshes(
     """
     sources = list_meshes(path)
     axes_to_canonical(up, front)  # a wrong axis is reported once, not for every mesh
-    return (load(source, up=up, front=front) for source in sources)
+    return (load(source, up=up, front=front, unit=unit) for source in sources)
 
 
-def load(source: MeshSource, *, up: str = "y", front: str = "z") -> Model | Skipped:
+def load(
+    source: MeshSource, *, up: str = "y", front: str = "z", unit: UnitName = "m"
+) -> Model | Skipped:
     """Load one mesh, flattened and turned so that `up` becomes +y and `front` becomes +z. [host]
 
-    Materials and pictures are dropped. Where a furniture catalogue describes the mesh, its rotation
-    and its size in centimetres are applied first, as Sweet Home 3D does.
+    Materials, pictures and what stands beside the object (`helpers`) are left out. Where a
+    furniture catalogue describes the mesh, its rotation and its size in centimetres are applied
+    first, as Sweet Home 3D does.
 
     Args:
         source: The mesh, from `jaxshape.data.archives.list_meshes`.
-        up: Axis of the file that points up: `x`, `y`, `z`, or one of these with a minus.
+        up: Axis of the file that points up, unless the source says it: `x`, `y`, `z`, or one of
+            these with a minus.
         front: Axis of the file along which the object's front looks, perpendicular to `up`.
+        unit: Unit of the file: "m", "cm", "mm" or "inch".
 
     Returns:
         The mesh; `Skipped`, never an exception, for a file that is broken or holds nothing to use.
@@ -114,57 +124,55 @@ def load(source: MeshSource, *, up: str = "y", front: str = "z") -> Model | Skip
     Raises:
         ValueError: The axes are not perpendicular axes.
     """
+    up, front = source.axes or (up, front)
     axes_to_canonical(up, front)
     try:
-        mesh = _usable(_parse(source))
+        parsed, notes = _parse(source, up)
+        mesh, lost = _usable(parsed)
+        mesh.vertices *= UNITS[unit]
         _apply_catalogue(mesh, source.metadata)
-        return Model(source.name, canonical(mesh, up=up, front=front), dict(source.metadata))
+        turned = canonical(mesh, up=up, front=front)
+        return Model(source.name, turned, dict(source.metadata), notes + lost, digest(source))
     except _Unusable as problem:
         return Skipped(source.name, *problem.args)
-    except TooLarge as problem:
+    except (TooLarge, TooManyFaces) as problem:
         return Skipped(source.name, "too large", str(problem))
+    except NotSupported as problem:
+        return Skipped(source.name, "not supported", str(problem))
+    except Unreadable as problem:
+        return Skipped(source.name, "unreadable", str(problem))
     except Exception as problem:  # parsers of foreign files fail in any way there is
         detail = " ".join(f"{type(problem).__name__}: {problem}".split())
         return Skipped(source.name, "unreadable", detail[:300])
 
 
-def _parse(source: MeshSource) -> trimesh.Trimesh:
-    """Return all triangles of a file as one mesh, scene transforms applied."""
+def _parse(source: MeshSource, up: str) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
+    """All triangles of a file as one mesh, and what was left out."""
     content = read_bytes(source)
-    file_type = os.path.splitext(source.member or source.path)[1].lower()
     if not content.strip(b"\0 \t\r\n"):
         raise _Unusable("empty", "The file has no content.")
-    if file_type == ".off":
-        # Many ModelNet files run the counts into the header: "OFF490926 518 0".
-        content = re.sub(rb"\A(\s*C?OFF)(?=\d)", rb"\1\n", content, count=1)
-    scene = trimesh.load_scene(
-        io.BytesIO(content),
-        file_type=file_type[1:],
-        resolver=Beside(source),
-        process=False,
-        skip_materials=True,
-    )
-    faces = sum(
-        len(getattr(scene.geometry[scene.graph[node][1]], "faces", ()))
-        for node in scene.graph.nodes_geometry
-    )
-    if faces > MAX_FACES:
-        raise _Unusable("too large", f"The mesh has {faces} faces, more than {MAX_FACES}.")
-    mesh = scene.to_mesh()
-    if not len(mesh.vertices):
+    suffix = os.path.splitext(source.member or source.path)[1].lower()
+    parts = read_parts(suffix, content, lambda name: read_bytes(source, name))
+    if not any(len(part.vertices) for part in parts):
         raise _Unusable("empty", "The file holds no vertices of a triangle mesh.")
-    return mesh
+    parts, notes = without_helpers(parts, up)
+    if not parts:
+        raise _Unusable("no faces", "The file holds vertices and no triangle.")
+    _, vertices, faces = zip(*parts, strict=True)
+    vertices, faces = trimesh.util.append_faces(vertices, faces)
+    return trimesh.Trimesh(vertices, faces, process=False), notes
 
 
-def _usable(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the triangles that have a finite, nonzero area, or say why there are none."""
+def _usable(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
+    """The triangles that have a finite, nonzero area, and how many have none that is finite.
+
+    Raises:
+        _Unusable: Nothing is left, or it has no extent along an axis.
+    """
     vertices = np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
-    if not len(faces):
-        raise _Unusable("no faces", f"The file holds {len(vertices)} vertices and no triangle.")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise _Unusable("unreadable", "A face refers to a vertex that the file does not hold.")
-    faces = faces[np.all(np.isfinite(vertices[faces]), axis=(1, 2))]
+    total, faces = len(faces), faces[np.all(np.isfinite(vertices[faces]), axis=(1, 2))]
+    lost = total - len(faces)
     if not len(faces):
         raise _Unusable("not finite", "Every face has a vertex that is not a finite number.")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -179,7 +187,23 @@ def _usable(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if usable.extents.min() <= FLAT * usable.extents.max():
         size = " x ".join(f"{extent:.3g}" for extent in usable.extents)
         raise _Unusable("flat", f"The mesh measures {size}: one axis has no extent.")
-    return usable
+    return usable, (f"faces left out: {lost} have a corner that is not finite.",) if lost else ()
+
+
+def digest(source: MeshSource) -> str:
+    """A digest of all that decides the shape in a file, whatever the file's name and place are.
+
+    Args:
+        source: The mesh. Files that it refers to and that are missing count as empty.
+    """
+    content = read_bytes(source)
+    found = hashlib.sha256(content)
+    for name in referred(content):
+        with suppress(Exception):  # what is missing or broken is reported by whoever needs it
+            found.update(read_bytes(source, name))
+    about = sorted(source.metadata.items()), source.axes
+    found.update(repr(about).encode("utf-8", "surrogateescape"))
+    return found.hexdigest()
 
 
 def _apply_catalogue(mesh: trimesh.Trimesh, metadata: dict[str, str]) -> None:
@@ -280,3 +304,12 @@ def lying_on_its_side(mesh: trimesh.Trimesh) -> bool:
     So believe it of a set of meshes, by majority; stools and poufs look much the same either way.
     """
     return apparent_up(sample_surface(mesh, 6000, seed=0)) != "y"
+
+
+def resembles_a_seat(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh stands in one of the directions along its axes as seats and tables do.
+
+    Args:
+        mesh: The mesh, however it lies.
+    """
+    return max(up_scores(sample_surface(mesh, 6000, seed=0)).values()) > SEAT

@@ -1,39 +1,79 @@
-"""The meshes of a collection that are kept out of training. [host]"""
+"""The meshes of a collection that are kept out of training, by what they are. [host]"""
 
 import hashlib
 from collections.abc import Sequence
 
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
 from jaxshape.data.archives import MeshSource
+from jaxshape.data.survey import Surveyed
 
 SHARE = 0.1
 """Share of the meshes that are held out."""
 
+SAME = 1e-3
+"""Signatures that differ less, in all numbers, are of the same shape."""
 
-def hold_out(sources: Sequence[MeshSource]) -> tuple[list[MeshSource], list[MeshSource]]:
+COARSE = 2
+"""Decimals of a signature that decide the side of a mesh."""
+
+
+def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[MeshSource]]:
     """Divide meshes into those to train on, and about every tenth, but at least one, held out.
 
-    The side depends on the name alone: a mesh stays on its side when others join the collection, so
-    that training can go on from earlier weights and never meets a mesh it is scored on.
+    The side depends on the shape alone, not on the name, the folder or the format: a mesh stays on
+    its side when others join the collection, so that training can go on from earlier weights and
+    never meets a mesh it is scored on; and copies are on one side.
 
     Args:
-        sources: Meshes of the collection, two or more.
+        meshes: Meshes of the collection, of which two or more are usable and differ.
 
     Returns:
-        The meshes to train on, and those held out.
+        The meshes to train on, those that cannot be used among them, and those held out.
 
     Raises:
-        ValueError: There are fewer than two meshes.
+        ValueError: There are fewer than two different meshes.
     """
-    if len(sources) < 2:
+    usable = [mesh for mesh in meshes if mesh.skipped is None]
+    groups = same_shapes(usable)
+    count = len(set(groups))
+    if count < 2:
         raise ValueError(
-            f"There is {len(sources)} mesh; give two or more, to train on some and score on others."
+            f"There {'is 1 mesh' if len(usable) == 1 else f'are {len(usable)} meshes'} of {count} "
+            "shape that can be used; give two or more, to train on some and score on others."
         )
-    by_mark = sorted(sources, key=_mark)
-    marked = sum(_mark(source) < SHARE for source in sources)
-    held_out = by_mark[: min(max(marked, 1), len(sources) - 1)]
-    return [source for source in sources if source not in held_out], held_out
+    marks: dict[int, float] = {}
+    for group, mesh in zip(groups, usable, strict=True):
+        marks[group] = min(_mark(mesh), marks.get(group, 1.0))
+    chosen = sorted(marks, key=lambda group: marks[group])
+    marked = sum(mark < SHARE for mark in marks.values())
+    kept_out = set(chosen[: min(max(marked, 1), count - 1)])
+    held_out = [
+        mesh.source for group, mesh in zip(groups, usable, strict=True) if group in kept_out
+    ]
+    places = {(source.path, source.member) for source in held_out}
+    training = [mesh.source for mesh in meshes]
+    return [s for s in training if (s.path, s.member) not in places], held_out
 
 
-def _mark(source: MeshSource) -> float:
-    """A number from 0 to 1 that is spread evenly over names."""
-    return int.from_bytes(hashlib.sha256(source.name.encode()).digest()[:8]) / 2**64
+def same_shapes(meshes: Sequence[Surveyed]) -> list[int]:
+    """A number for each mesh, the same for those of the same shape.
+
+    Args:
+        meshes: Meshes that can be used.
+    """
+    if not meshes:
+        return []
+    tree = KDTree([mesh.signature for mesh in meshes])
+    a, b = tree.query_pairs(SAME, p=np.inf, output_type="ndarray").T
+    near = coo_matrix((np.ones(len(a)), (a, b)), (len(meshes), len(meshes)))
+    return connected_components(near, directed=False)[1].tolist()
+
+
+def _mark(mesh: Surveyed) -> float:
+    """A number from 0 to 1 that is spread evenly over shapes."""
+    rounded = " ".join(f"{value:.{COARSE}f}" for value in mesh.signature)
+    return int.from_bytes(hashlib.sha256(rounded.encode()).digest()[:8]) / 2**64

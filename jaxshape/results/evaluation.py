@@ -163,7 +163,8 @@ def evaluate(
             if ceilings is not None:
                 for scores in frames.values():
                     scores["bounds"]["ceiling"] = float(ceilings[i])
-            yield {"name": model.name, "metadata": model.metadata, "frames": frames}
+            about = {"name": model.name, "content": model.digest, "metadata": model.metadata}
+            yield about | {"frames": frames}
 
 
 def by_each_method(

@@ -1,7 +1,7 @@
 """Rows of a long run, kept as they come: a killed run goes on after its last row. [host]"""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from glob import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +35,21 @@ class Journal:
         self.rows |= rows
         self.seconds += seconds
         self.write({})
+
+    def forget(self, contents: Mapping[str, str]) -> None:
+        """Leave out rows of another content, as of files that have changed since.
+
+        Args:
+            contents: Digests by the names of rows; other rows stay.
+        """
+        stale = {
+            name
+            for name, row in self.rows.items()
+            if name in contents and row.get("content", "") != contents[name]
+        }
+        if stale:
+            self.rows = {name: row for name, row in self.rows.items() if name not in stale}
+            self.write({})
 
     def write(self, findings: dict[str, Any]) -> None:
         """Write the file anew, with what the rows say put before them."""

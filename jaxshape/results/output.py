@@ -15,11 +15,12 @@ from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.geometry.overlap import iou
 from jaxshape.geometry.pixels import Sensor
+from jaxshape.mapping.map.doubts import ALL_SEEN, Unseen
 from jaxshape.results.coloring import ColorView, color_vertices
 from jaxshape.results.fused_surface import fuse_surface
 from jaxshape.results.surface import surface, write_mesh
 from jaxshape.results.traces import write_trace
-from jaxshape.results.verdict import SeenView, judged, quality_of
+from jaxshape.results.verdict import SeenView, judged, quality_of, quality_of_cloud
 from jaxshape.search.reconstruction import Reconstruction
 from jaxshape.search.refiner import StopReason
 
@@ -47,6 +48,9 @@ class Observation(NamedTuple):
         sensor: How the noise of depth grows.
         keyframes: The keyframes that the mesh is judged by; none leave it unjudged.
         floor: Height of the floor in the object frame, in metres; NaN where it is not known.
+        unseen: What no keyframe saw of the object.
+        cloud: Points in the object frame that the mesh is judged by where there are no keyframes
+            `[n 3]`, in metres; None leaves it unjudged.
     """
 
     depth: Sequence[Float[np.ndarray, "_ _"]]
@@ -60,6 +64,8 @@ class Observation(NamedTuple):
     sensor: Sensor = Sensor()
     keyframes: Sequence[SeenView] = ()
     floor: float = np.nan
+    unseen: Unseen = ALL_SEEN
+    cloud: Float[np.ndarray, "n 3"] | None = None
 
 
 def write_result(
@@ -116,9 +122,9 @@ def write_shape(
     else:
         write_trace(folder / "trace.npz", jax.tree.map(lambda x: x[: one.iterations], one.trace))
     told = {**figures, **_searched(one), **_of_mesh(found), **_measured(observation, one)}
-    return (
-        told | _judged(observation, found, bool(one.symmetric)) if observation.keyframes else told
-    )
+    if not observation.keyframes and observation.cloud is None:
+        return told
+    return told | _judged(observation, found, bool(one.symmetric))
 
 
 class ShapeMesh(NamedTuple):
@@ -173,14 +179,21 @@ def _of_mesh(found: ShapeMesh) -> dict[str, Any]:
 
 
 def _judged(observation: Observation, found: ShapeMesh, is_mirrored: bool) -> dict[str, Any]:
-    quality = quality_of(
-        found.mesh,
-        found.measured,
-        observation.keyframes,
-        axial=observation.sensor.axial,
-        is_mirrored=is_mirrored,
-        floor=observation.floor,
-    )
+    if observation.cloud is not None:
+        voxel = float(np.max(observation.frame.voxel_size))
+        quality = quality_of_cloud(
+            found.mesh, observation.cloud, voxel=voxel, is_mirrored=is_mirrored
+        )
+    else:
+        quality = quality_of(
+            found.mesh,
+            found.measured,
+            observation.keyframes,
+            axial=observation.sensor.axial,
+            is_mirrored=is_mirrored,
+            floor=observation.floor,
+            unseen=observation.unseen,
+        )
     verdict = judged(quality)
     return {
         "verdict": verdict.word,

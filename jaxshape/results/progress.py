@@ -23,7 +23,7 @@ from jaxshape.data.sequences.cameras import intrinsic_numbers
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grids import binary
-from jaxshape.mapping.map.doubts import doubts_of
+from jaxshape.mapping.map.doubts import doubts_of, unseen_of
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.map.state import MapState, grids_of
 from jaxshape.mapping.placement.finding import Start
@@ -63,7 +63,9 @@ def write_progress(
     start = progress.start
     if not running:
         keyframes, floor = seen_views(progress.state), floor_height(start)
-        observation = observation._replace(keyframes=keyframes, floor=floor)
+        observation = observation._replace(
+            keyframes=keyframes, floor=floor, unseen=unseen_of(progress)
+        )
     warnings = [*figures.get("warnings", ()), *start.warnings, *doubts_of(progress)]
     result = {**figures, **counts(progress), "notes": start.notes, "warnings": warnings}
     result["box"] = {

@@ -1,7 +1,8 @@
 """How good a result is where no truth is known, in figures and in words. [host]
 
-quality_of(...)   figures: of the mesh, and of the keyframes that it has to explain
-judged(quality)   good; doubtful because ...; failed because ...
+quality_of(...)         figures: of the mesh, and of the keyframes that it has to explain
+quality_of_cloud(...)   the same, for a point cloud
+judged(quality)         good; doubtful because ...; failed because ...
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,8 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import KDTree
+
+from jaxshape.mapping.map.doubts import ALL_SEEN, Unseen, joined
 
 CLOSE = 0.01
 """Metres from the mesh within which a measured point is explained, on top of the depth's noise."""
@@ -64,6 +67,8 @@ class Quality(NamedTuple):
         pieces: Pieces of the mesh that are not connected, crumbs apart.
         keyframes: Number of keyframes.
         empty_keyframes: Keyframes in which next to nothing was taken for the object.
+        unseen_faces: Names of the faces of its box at which it was not seen to end.
+        unseen_below: Share of its height, from below, of which nothing was measured.
     """
 
     explained: float
@@ -76,6 +81,8 @@ class Quality(NamedTuple):
     pieces: int
     keyframes: int
     empty_keyframes: int
+    unseen_faces: tuple[str, ...] = ()
+    unseen_below: float = 0.0
 
 
 class Verdict(NamedTuple):
@@ -106,6 +113,7 @@ def quality_of(
     axial: float,
     is_mirrored: bool = False,
     floor: float = np.nan,
+    unseen: Unseen = ALL_SEEN,
 ) -> Quality:
     """Compare a mesh with the keyframes it was made from.
 
@@ -116,22 +124,53 @@ def quality_of(
         axial: Standard deviation of depth, in metres at 1 m.
         is_mirrored: Whether what is hidden was completed from its mirror image.
         floor: Height of the floor in the object frame, in metres; NaN where it is not known.
+        unseen: What no keyframe saw of the object.
     """
     counts = np.array([view.segmented.sum() for view in views])
-    by_area = _shares(mesh, measured, is_mirrored)
-    low, high = mesh.bounds
-    return Quality(
+    return _of_mesh(mesh, measured, is_mirrored)._replace(
         explained=explained(mesh, views, axial),
-        measured=by_area[0],
-        mirrored=by_area[1],
-        predicted=by_area[2],
         free_violated=free_violated(mesh, views, axial),
-        size=(float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2])),
-        floor_gap=float(low[1] - floor),
-        pieces=pieces(mesh),
+        floor_gap=float(mesh.bounds[0, 1] - floor),
         keyframes=len(views),
         empty_keyframes=int(np.sum(counts < LITTLE * max(counts.max(initial=0), 1))),
+        unseen_faces=unseen.faces,
+        unseen_below=unseen.below,
     )
+
+
+def quality_of_cloud(
+    mesh: trimesh.Trimesh,
+    points: Float[np.ndarray, "n 3"],
+    *,
+    voxel: float,
+    is_mirrored: bool = False,
+) -> Quality:
+    """Compare a mesh with the point cloud it was completed from.
+
+    Args:
+        mesh: The mesh in the object frame, in metres.
+        points: The points, in the same frame.
+        voxel: Largest edge of the voxels that the mesh was made from, in metres: closer than
+            that neither can be told from the other.
+        is_mirrored: Whether what is hidden was completed from its mirror image.
+
+    Returns:
+        The figures; nothing is known of free space, of the floor and of what was seen.
+    """
+    close = max(CLOSE, voxel)
+    measured = np.isfinite(KDTree(points).query(mesh.vertices, distance_upper_bound=close)[0])
+    some = points[:: max(1, len(points) // _POINTS)]
+    is_near = _distance(mesh, some) < close
+    return _of_mesh(mesh, measured, is_mirrored)._replace(explained=float(np.mean(is_near)))
+
+
+def _of_mesh(
+    mesh: trimesh.Trimesh, measured: Bool[np.ndarray, " n"] | None, is_mirrored: bool
+) -> Quality:
+    """The figures of the mesh alone; as if it were right elsewhere."""
+    x, y, z = map(float, mesh.extents)
+    of_area = _shares(mesh, measured, is_mirrored)
+    return Quality(1.0, *of_area, 0.0, (x, y, z), np.nan, pieces(mesh), 0, 0)
 
 
 def explained(mesh: trimesh.Trimesh, views: Sequence[SeenView], axial: float) -> float:
@@ -183,6 +222,15 @@ GAP = 0.05
 SIZES = (0.05, 4.0)
 """Metres of the longest side between which an object of a room lies."""
 
+GUESSED, ALL_GUESSED = 2, 4
+"""Sides of the box at which the object was not seen to end, from which its size is doubtful, and
+from which it is the prior's alone. One is the rule: the back of a chair that was filmed from the
+front was right to 4 cm."""
+
+BARE, MOSTLY_BARE = 0.15, 0.4
+"""Share of the height, from below, without a measurement, from which legs are doubtful, and from
+which too little was seen: of a chair behind a table, the back."""
+
 
 def judged(quality: Quality) -> Verdict:
     """A verdict by fixed thresholds.
@@ -203,8 +251,12 @@ def _failures(q: Quality) -> Iterator[str]:
         yield f"{q.free_violated:.0%} of the mesh lie where the camera saw through"
     if not SIZES[0] <= max(q.size) <= SIZES[1]:
         yield f"the object would be {max(q.size):.2g} m large"
-    if 2 * q.empty_keyframes >= q.keyframes:
+    if q.keyframes and 2 * q.empty_keyframes >= q.keyframes:
         yield f"in {q.empty_keyframes} of {q.keyframes} keyframes next to nothing was taken for it"
+    if len(_unseen_sides(q)) >= ALL_GUESSED:
+        yield "where it ends was seen at none of its sides"
+    if q.unseen_below > MOSTLY_BARE:
+        yield f"nothing was measured of its lower {q.unseen_below:.0%}"
 
 
 def _doubts(q: Quality) -> Iterator[str]:
@@ -221,6 +273,14 @@ def _doubts(q: Quality) -> Iterator[str]:
         yield f"the mesh is in {q.pieces} pieces"
     if q.empty_keyframes:
         yield f"{q.empty_keyframes} of {q.keyframes} keyframes added next to nothing"
+    if len(sides := _unseen_sides(q)) >= GUESSED:
+        yield f"where it ends was not seen at its {joined(sides)}"
+    if q.unseen_below > BARE:
+        yield f"its lower {q.unseen_below:.0%}, legs or what else is there, are predicted"
+
+
+def _unseen_sides(q: Quality) -> tuple[str, ...]:
+    return tuple(face for face in q.unseen_faces if face not in ("bottom", "top"))
 
 
 # Parts -----------------------------------------------------------------------------------------

@@ -171,7 +171,13 @@ def refine(
 
 
 class _Begun(NamedTuple):
-    """Where an earlier search of each object stood."""
+    """Where the search of each object stands.
+
+    Attributes:
+        state: State of its refiner.
+        trace: Trace of its last iteration.
+        iterations: Iterations that it has taken `[object]`.
+    """
 
     state: Any
     trace: Trace
@@ -186,7 +192,17 @@ def _begun(previous: Refined) -> _Begun:
 
 
 class _Rows(NamedTuple):
-    """All that belongs to one object or another, with an axis over objects."""
+    """All that belongs to one object or another, with an axis over objects.
+
+    Attributes:
+        keys: Random key of each object.
+        codes: First codes `[object d]`.
+        targets: Targets of the residual.
+        grids: F and M, or None.
+        first_losses: Objectives of the first codes, or None.
+        begun: Where an interrupted search stood, or None.
+        warm_start: States of a search for an earlier measurement, or None.
+    """
 
     keys: Key[Array, " object"]
     codes: Float[Array, "object d"]
@@ -198,7 +214,16 @@ class _Rows(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """The loop over iterations, of a batch of objects."""
+    """The loop over iterations, of a batch of objects.
+
+    Attributes:
+        refiner: The search.
+        how: The scoring of codes.
+        space: Coordinates of the search.
+        own: What each object's objective has of its own.
+        target_loss: Loss that is low enough to stop, or None.
+        callback: Hears of every iteration, or None.
+    """
 
     refiner: Refiner
     how: Evaluation

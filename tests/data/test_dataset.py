@@ -1,20 +1,19 @@
 import json
 import os
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 
-from jaxshape.data import dataset
+from jaxshape.data import building, dataset, paths
 from jaxshape.data.archives import list_meshes
+from jaxshape.data.building import build_dataset
 from jaxshape.data.dataset import (
     OBJECTS_PER_SHARD,
     DatasetConfig,
     DatasetError,
-    build_dataset,
     hash_seed,
     object_paths,
     open_dataset,
@@ -23,6 +22,7 @@ from jaxshape.data.dataset import (
     unpack,
     unpack_measured,
 )
+from jaxshape.data.families import procedural_objects
 from jaxshape.geometry.grids import Grids
 
 CONFIG = DatasetConfig(paths=2, frames=(1, 2), cameras=("paper",))
@@ -43,10 +43,8 @@ def objects(tmp_path_factory):
 
 
 def build_here(folder, objects, config=CONFIG):
-    """Build in this process, whose compiled functions are ready; one shard after the other."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "ProcessPoolExecutor", lambda _, mp_context: ThreadPoolExecutor(1))
-        return list(build_dataset(folder, objects, config))
+    """Build in this process, whose compiled functions are ready."""
+    return list(build_dataset(folder, objects, config, workers=1))
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +103,7 @@ def test_processes_write_the_same_bytes_as_one_thread(objects, built, tmp_path):
 
 def test_progress_counts_objects_and_what_was_skipped(objects, built):
     progress = built[1]
-    assert [p.objects for p in progress] == [0, OBJECTS_PER_SHARD, OBJECTS_PER_SHARD + 1]
+    assert [p.objects for p in progress] == list(range(OBJECTS_PER_SHARD + 2))
     assert {p.total for p in progress} == {len(objects)}
     skipped = progress[-1].skipped
     assert sorted(s.name for s in skipped) == [f"{i:03d}" for i in range(1, OBJECTS_PER_SHARD)]
@@ -133,7 +131,26 @@ def test_what_is_read_is_what_was_made_of_each_object(objects, built):
         assert (opened.grids(index, 0, 0).occupied != opened.grids(index, 1, 0).occupied).any()
 
 
-def test_a_build_goes_on_where_it_was_killed(objects, built, copied):
+def test_a_build_goes_on_after_its_last_object(objects, built, tmp_path, monkeypatch):
+    """Killed while the second of three objects was made, whose arrays were half written."""
+    few = [objects[0], objects[1], objects[OBJECTS_PER_SHARD]]
+    progress = build_dataset(tmp_path, few, CONFIG, workers=1)
+    assert [next(progress).objects for _ in range(2)] == [0, 1]
+    progress.close()
+    (tmp_path / "parts" / "00000001.npz").write_bytes(b"half")
+    made = []
+    whole = building._make_part
+    monkeypatch.setattr(
+        building,
+        "_make_part",
+        lambda folder, config, it: made.append(it[0]) or whole(folder, config, it),
+    )
+    assert [p.objects for p in build_here(tmp_path, few)] == [1, 2, 3] and made == [1, 2]
+    assert not (tmp_path / "parts").exists()
+    assert open_dataset(tmp_path).names == ["000", f"{OBJECTS_PER_SHARD:03d}"]
+
+
+def test_a_shard_whose_names_are_missing_is_made_anew(objects, built, copied):
     """The kill came while the arrays of the second shard were being written."""
     (copied / "shard-00001.json").unlink()
     (copied / "shard-00001.measured.npy").write_bytes(b"half")
@@ -143,6 +160,45 @@ def test_a_build_goes_on_where_it_was_killed(objects, built, copied):
     assert len(progress[-1].skipped) == OBJECTS_PER_SHARD - 1
     assert contents(copied) == contents(built[0])
     assert (copied / "shard-00000.surface.npy").stat().st_mtime_ns == untouched.st_mtime_ns
+
+
+def test_a_repaired_file_is_made_anew(objects, copied, tmp_path):
+    """A file that was empty is a box now; the other shard is left alone."""
+    untouched = (copied / "shard-00001.surface.npy").stat()
+    repaired = shutil.copytree(os.path.dirname(objects[0].path), tmp_path / "repaired")
+    trimesh.creation.box((1, 1, 2)).export(repaired / "001.off")
+    progress = build_here(copied, list_meshes(repaired))
+    assert progress[0].objects == 1 and progress[-1].objects == len(objects)
+    assert open_dataset(copied).names == ["000", "001", f"{OBJECTS_PER_SHARD:03d}"]
+    assert (copied / "shard-00001.surface.npy").stat().st_mtime_ns == untouched.st_mtime_ns
+
+
+def test_a_dataset_without_contents_is_finished_and_can_be_read(objects, copied):
+    """As earlier versions of this format wrote them."""
+    for shard in ("shard-00000.json", "shard-00001.json"):
+        about = json.loads((copied / shard).read_text())
+        (copied / shard).write_text(json.dumps({k: about[k] for k in ("names", "skipped")}))
+    claim = json.loads((copied / "dataset.json").read_text())
+    del claim["config"]["unit"]
+    (copied / "dataset.json").write_text(json.dumps(claim))
+    (progress,) = build_dataset(copied, objects, CONFIG)
+    assert progress.objects == len(objects) and len(open_dataset(copied).names) == 2
+
+
+def test_an_object_of_which_nothing_is_measured_is_left_out(tmp_path, monkeypatch):
+    drawn = []
+
+    def draw_path(mesh, config, seed):
+        drawn.append(seed)
+        empty = np.zeros((1, 32, 32, 32), np.float32)
+        return paths.Path(np.ones((32, 32, 32), bool), Grids(empty, empty))
+
+    monkeypatch.setattr(dataset, "draw_path", draw_path)
+    *_, progress = build_here(
+        tmp_path, procedural_objects("chair", 1), replace(CONFIG, frames=(1,), paths=1)
+    )
+    assert len(set(drawn)) == 3
+    assert [(s.name, s.reason) for s in progress.skipped] == [("chair-0", "nothing measured")]
 
 
 def test_a_finished_build_has_nothing_left_to_do(objects, built):

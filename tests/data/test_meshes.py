@@ -1,3 +1,4 @@
+import os
 import pickle
 import zipfile
 
@@ -6,10 +7,12 @@ import pytest
 import trimesh
 
 from jaxshape.data import archives
+from jaxshape.data.archives import passed_over
 from jaxshape.data.meshes import (
     Model,
     Skipped,
     canonical,
+    digest,
     in_metres,
     list_meshes,
     load,
@@ -116,6 +119,45 @@ def test_listing_is_sorted_picklable_and_opens_nothing(tmp_path):
     assert [source.name for source in sources] == ["a", "b", "c/a"]
     assert pickle.loads(pickle.dumps(sources)) == sources
     assert len(pickle.dumps(sources[0])) < 1000
+
+
+def test_names_that_are_not_utf_8_can_be_written_and_their_files_be_read(tmp_path):
+    (tmp_path / "sub").mkdir()
+    place = os.fsencode(tmp_path / "sub")
+    for name in (b"caf\xe9.obj", "caf\u00e9.obj".encode()):
+        with open(os.path.join(place, name), "w") as file:
+            file.write(OBJ)
+    models = list(read_meshes(tmp_path))
+    assert [model.name for model in models] == ["sub/caf\\xe9", "sub/caf\u00e9"]
+    assert all(isinstance(model, Model) and model.name.encode() for model in models)
+
+
+def test_a_folder_that_cannot_be_opened_is_reported(tmp_path, monkeypatch):
+    for name in ("a.obj", "closed/b.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(OBJ)
+
+    def refusing(function):
+        def refuse(path="."):
+            if os.fspath(path).endswith("closed"):
+                raise PermissionError(13, "Permission denied", os.fspath(path))
+            return function(path)
+
+        return refuse
+
+    monkeypatch.setattr(os, "scandir", refusing(os.scandir))  # root may open any folder
+    monkeypatch.setattr(os, "listdir", refusing(os.listdir))
+    good, closed = read_meshes(tmp_path)
+    assert isinstance(good, Model) and (closed.name, closed.reason) == ("closed", "unreadable")
+    assert "Permission denied" in closed.detail
+
+
+def test_what_is_passed_over_is_counted(tmp_path):
+    for name in ("a.obj", "b.fbx", "c.FBX", "d.blend", "e.png", ".hidden.fbx"):
+        (tmp_path / name).write_text("x")
+    (tmp_path / "link").symlink_to(tmp_path)
+    assert passed_over(tmp_path) == {".fbx": 2, ".blend": 1, "linked folders": 1}
+    assert not passed_over(tmp_path / "a.obj")
 
 
 def test_equal_names_keep_their_suffix(tmp_path):
@@ -304,6 +346,52 @@ def test_nothing_to_read_says_what_was_looked_for(tmp_path):
     (tmp_path / "a.blend").write_text("x")
     with pytest.raises(ValueError, match="no mesh"):
         list_meshes(tmp_path / "a.blend")
+
+
+# What is not the object
+
+
+def test_colliders_shadows_and_the_ground_are_left_out_and_named(tmp_path):
+    chair, wide = trimesh.creation.box(SIZE), trimesh.creation.box((3, 3, 3))
+    plane = trimesh.Trimesh([[-1, -0.45, -1], [1, -0.45, -1], [1, -0.45, 1], [-1, -0.45, 1]],
+                            [[0, 2, 1], [0, 3, 2]], process=False)  # fmt: skip
+    for name in ("chair_collider", "UCX_chair_01", "chair-colonly", "ContactShadow", "floor.001"):
+        scene = trimesh.Scene({"seat": chair, name: wide})
+        scene.export(tmp_path / "a.glb")
+        model = one(tmp_path / "a.glb")
+        np.testing.assert_allclose(model.mesh.extents, SIZE, atol=1e-6)
+        assert len(model.notes) == 1 and name in model.notes[0]
+    trimesh.Scene({"seat": chair, "Plane": plane}).export(tmp_path / "a.glb")
+    np.testing.assert_allclose(one(tmp_path / "a.glb").mesh.extents, SIZE, atol=1e-6)
+    lamp = trimesh.Scene({"seat": chair, "floor_lamp": wide})
+    lamp.export(tmp_path / "a.glb")
+    np.testing.assert_allclose(one(tmp_path / "a.glb").mesh.extents, [3, 3, 3], atol=1e-6)
+
+
+def test_a_file_of_nothing_but_a_collider_is_kept(tmp_path):
+    trimesh.Scene({"collider": trimesh.creation.box(SIZE)}).export(tmp_path / "a.glb")
+    assert one(tmp_path / "a.glb").notes == ()
+
+
+def test_a_unit_scales_what_has_no_size_of_a_catalogue(tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ)
+    for unit, scale in (("cm", 0.01), ("mm", 0.001), ("inch", 0.0254)):
+        np.testing.assert_allclose(one(tmp_path, unit=unit).mesh.extents, scale * np.array(SIZE))
+
+
+# Content
+
+
+def test_a_digest_knows_the_content_and_not_the_name(tmp_path):
+    for folder, name in (("one", "a"), ("two", "b")):
+        for file, content in trimesh.Scene(asymmetric()).export(file_type="gltf").items():
+            (tmp_path / folder).mkdir(exist_ok=True)
+            (tmp_path / folder / file.replace("model", name)).write_bytes(content)
+    ((one_,), (two,)) = (list_meshes(tmp_path / folder) for folder in ("one", "two"))
+    assert digest(one_) == digest(two) == load(two).digest and len(digest(one_)) == 64
+    buffer = min((tmp_path / "two").glob("*.bin"))
+    buffer.write_bytes(buffer.read_bytes()[:-1] + b"\x01")
+    assert digest(one_) != digest(two)
 
 
 # Sampling

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from jaxshape.data.building import build_dataset
 from jaxshape.data.config import DatasetConfig
-from jaxshape.data.dataset import build_dataset
 from jaxshape.data.families import procedural_objects
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "training_choices.py"

@@ -4,10 +4,11 @@ import jax
 import numpy as np
 import pytest
 
+from jaxshape.data.building import build_dataset
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.config import DatasetConfig
-from jaxshape.data.dataset import build_dataset, open_dataset
+from jaxshape.data.dataset import open_dataset
 from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.geometry import camera, fusion
 from jaxshape.model.config import Architecture, TrainConfig

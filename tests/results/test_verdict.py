@@ -13,6 +13,7 @@ from jaxshape.results.verdict import (
     judged,
     pieces,
     quality_of,
+    quality_of_cloud,
 )
 
 AXIAL = 1.6e-3
@@ -115,6 +116,23 @@ def test_a_result_in_words():
     assert verdict_in_words({}) == ""
 
 
+def test_one_side_that_was_not_seen_is_the_rule():
+    assert judged(GOOD._replace(unseen_faces=("bottom", "back"))).word == "good"
+
+
+def test_a_completed_cloud_is_judged_by_its_points():
+    mesh, rng = block(), np.random.default_rng(0)
+    right = mesh.vertices[mesh.vertices[:, 0] > 0.05]
+    points = right + rng.normal(0, 0.002, right.shape)
+    found = quality_of_cloud(mesh, points, voxel=0.015)
+    assert found.explained == 1 and judged(found).word == "good"
+    assert 0.3 < found.measured < 0.5 and found.mirrored == 0
+    assert quality_of_cloud(mesh, points, voxel=0.015, is_mirrored=True).mirrored > 0.2
+    away = quality_of_cloud(mesh, points + [0.0, 0.1, 0.0], voxel=0.015)
+    assert away.explained == pytest.approx(0.5, abs=0.25)
+    assert judged(away).word != "good"
+
+
 def test_a_good_result_has_no_reasons():
     assert judged(GOOD) == ("good", ()) and judged(GOOD).sentence == "good"
 
@@ -132,6 +150,14 @@ def test_a_good_result_has_no_reasons():
         ({"pieces": 4}, "doubtful", "in 4 pieces"),
         ({"empty_keyframes": 2}, "doubtful", "2 of 6 keyframes added next to nothing"),
         ({"empty_keyframes": 4}, "failed", "in 4 of 6 keyframes"),
+        ({"unseen_faces": ("back", "front", "top")}, "doubtful", "not seen at its back and front"),
+        (
+            {"unseen_faces": ("left side", "right side", "bottom", "back", "front")},
+            "failed",
+            "at none of its sides",
+        ),
+        ({"unseen_below": 0.3}, "doubtful", "its lower 30%, legs"),
+        ({"unseen_below": 0.6}, "failed", "nothing was measured of its lower 60%"),
         ({"size": (0.5, 9.0, 0.5)}, "failed", "would be 9 m large"),
         ({"size": (0.01, 0.01, 0.02)}, "failed", "would be 0.02 m large"),
     ],

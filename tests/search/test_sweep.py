@@ -22,7 +22,7 @@ TARGETS = Target(*jnp.asarray(rng.random((2, OBJECTS, *SHAPE)), jnp.float32))
 GRIDS = {
     "cma": {"sigma0": jnp.geomspace(0.01, 1, 8), "prior_weight": jnp.linspace(0, 3, 8)},
     "gradient:adam": {"step_size": jnp.geomspace(0.01, 1, 8), "bound": jnp.linspace(1, 3, 8)},
-    "gauss-newton": {"tolerance": jnp.geomspace(1e-3, 1, 8), "target": jnp.linspace(0.1, 0.5, 8)},
+    "gauss-newton": {"tolerance": jnp.geomspace(1e-3, 1, 8), "prior_weight": jnp.linspace(0, 3, 8)},
 }
 
 

@@ -2,8 +2,8 @@
 
 A layout is two functions: whether a folder `fits` it, and one that lists the files of each frame.
 Images are read, and checked, one frame at a time when asked for, so a long sequence never fills the
-memory. Rooms, in the order of data: `frames` (what is read), `text`, `poses`, `trajectories`,
-`cameras`, `listing` (which images belong together), `seven_scenes`, `tum`, `folders` (the layouts),
+memory. In the order of data: `frames` (what is read), `text`, `poses`, `trajectories`, `cameras`,
+`listing` (which images belong together), the room `layouts` with a file for each kind of recording,
 `unread` (files without use), `conventions` (how others write poses and depth), `evidence` (do the
 poses fit the images?), `hypotheses` (in which convention do they?), `figures` and `inspection`
 (what to know of a recording, and what to doubt).
@@ -22,19 +22,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape import limits
-from jaxshape.data.sequences import (
-    arrays,
-    bop,
-    folders,
-    nerfstudio,
-    record3d,
-    replica,
-    scannet,
-    seven_scenes,
-    stray_scanner,
-    tum,
-    wild_rgbd,
-)
 from jaxshape.data.sequences.cameras import (
     Camera,
     default_camera,
@@ -49,6 +36,20 @@ from jaxshape.data.sequences.frames import Sequence as Sequence
 from jaxshape.data.sequences.frames import SequenceError as SequenceError
 from jaxshape.data.sequences.frames import read_depth as read_depth
 from jaxshape.data.sequences.frames import read_shape, same_aspect, size
+from jaxshape.data.sequences.layouts import (
+    arrays,
+    bop,
+    folders,
+    icl_nuim,
+    nerfstudio,
+    record3d,
+    replica,
+    scannet,
+    seven_scenes,
+    stray_scanner,
+    tum,
+    wild_rgbd,
+)
 from jaxshape.data.sequences.listing import Contents, Listed, list_folder
 from jaxshape.data.sequences.poses import check_rigid as check_rigid
 from jaxshape.data.sequences.trajectories import Pinhole as Pinhole
@@ -86,6 +87,7 @@ LAYOUTS: dict[str, Layout] = {
         "depth/*.png, intrinsic/intrinsic_depth.txt", scannet.fits, scannet.list_frames
     ),
     "replica": Layout("results/depth*.png, traj.txt", replica.fits, replica.list_frames),
+    "icl-nuim": Layout("depth/*.png, *.gt.freiburg", icl_nuim.fits, icl_nuim.list_frames),
     "npz": Layout("one .npz with depth, K", arrays.fits, arrays.list_frames),
     "redwood": Layout("depth/N-TIME.png", folders.fits_redwood, folders.list_redwood),
     "bundlesdf": Layout("depth/*.png, cam_K.txt", folders.fits_bundlesdf, folders.list_bundlesdf),

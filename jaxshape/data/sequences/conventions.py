@@ -162,8 +162,7 @@ def read_as(sequence: Sequence, convention: Convention) -> Sequence:
     if any(name in OF_POSES for name in names):
         sequence = replace(sequence, read_pose=partial(_pose, sequence.read_pose, names))
     if any(name in OF_DEPTH for name in names):
-        correct = partial(our_depth, K=sequence.intrinsics, names=names)
-        sequence = replace(sequence, correct_depth=correct)
+        sequence = replace(sequence, correct_depth=partial(our_depth, names=names))
     return replace(sequence, depth_scale=convention.depth_scale or sequence.depth_scale)
 
 

@@ -33,6 +33,8 @@ class Pair(NamedTuple):
         depth_b: Depth of the second frame, alike.
         T_a: Pose of the first frame `[4 4]`, as it is written.
         T_b: Pose of the second frame, alike.
+        K_a: Camera matrix of the first frame `[3 3]`, in pixels.
+        K_b: Camera matrix of the second frame, alike.
         by_columns: Whether the matrices are stored by columns, and were transposed as a whole.
     """
 
@@ -40,6 +42,8 @@ class Pair(NamedTuple):
     depth_b: Float[np.ndarray, "h w"]
     T_a: Pose
     T_b: Pose
+    K_a: Float[np.ndarray, "3 3"]
+    K_b: Float[np.ndarray, "3 3"]
     by_columns: bool
 
 
@@ -81,14 +85,17 @@ def _most_telling(
     a, pose_a, best = read(first), _pose(sequence, first), None
     if a is None or pose_a is None:
         return None
-    points = _points(a, sequence.intrinsics)
+    K_a = sequence.camera_of(first)
+    points = _points(a, K_a)
     for second in (first + stride for stride in STRIDES if first + stride < len(sequence)):
         b, pose_b = read(second), _pose(sequence, second)
         if b is None or pose_b is None:
             continue
-        still = _same_surface(points, b, sequence.intrinsics, np.eye(4), TOLERANCE)
+        K_b = sequence.camera_of(second)
+        still = _same_surface(points, b, K_b, np.eye(4), TOLERANCE)
         if still < (HARDLY_MOVED if best is None else best[0]):
-            best = still, Pair(a, b, pose_a[0], pose_b[0], pose_a[1] or pose_b[1])
+            is_turned = pose_a[1] or pose_b[1]
+            best = still, Pair(a, b, pose_a[0], pose_b[0], K_a, K_b, is_turned)
         if still < MOVED:
             break
     return best
@@ -100,7 +107,8 @@ def _depth(sequence: Sequence, index: int) -> Float[np.ndarray, "h w"] | None:
         raw = read_raw_depth(sequence.files[index].depth, sequence.shape)
         valid = (raw > 0) & (raw < SATURATED)
         depth = np.where(valid, raw / sequence.depth_scale, 0)
-        depth = depth if sequence.correct_depth is None else sequence.correct_depth(depth)
+        if sequence.correct_depth is not None:
+            depth = sequence.correct_depth(depth, sequence.camera_of(index))
         return depth if valid.any() else None
     return None
 
@@ -123,28 +131,24 @@ def stored_by_columns(sequence: Sequence) -> bool:
     return any(pose is not None and pose[1] for pose in poses)
 
 
-def seen_by(
-    pairs: tuple[Pair, ...], K: Float[np.ndarray, "3 3"], names: tuple[str, ...] = ()
-) -> tuple[Seen, ...]:
+def seen_by(pairs: tuple[Pair, ...], names: tuple[str, ...] = ()) -> tuple[Seen, ...]:
     """The pairs with depth images that are taken as written in these conventions.
 
     Args:
         pairs: The pairs.
-        K: The camera matrix.
         names: Names of conventions; those of poses are passed over.
     """
 
     def both() -> Iterator[Seen]:
         for pair in pairs:
-            a, b = (our_depth(depth, K, names) for depth in (pair.depth_a, pair.depth_b))
-            yield Seen(_points(a, K), b, pair)
+            a = our_depth(pair.depth_a, pair.K_a, names)
+            yield Seen(_points(a, pair.K_a), our_depth(pair.depth_b, pair.K_b, names), pair)
 
     return tuple(both())
 
 
 def agreement(
     seen: tuple[Seen, ...],
-    K: Float[np.ndarray, "3 3"],
     names: tuple[str, ...] = (),
     *,
     longer: float = 1.0,
@@ -157,7 +161,6 @@ def agreement(
 
     Args:
         seen: The pairs, with depth images in our convention.
-        K: The camera matrix.
         names: Names of conventions in which the poses are taken as written.
         longer: Factor by which the depth images are made shallower: that of their depth scale.
         tolerance: Share of the depth within which two frames see the same surface.
@@ -170,7 +173,7 @@ def agreement(
         undo = tuple(name for name in names if not (pair.by_columns and name == "transposed"))
         T_b_a = np.linalg.inv(our_pose(pair.T_b, undo)) @ our_pose(pair.T_a, undo)
         T_b_a[:3, 3] *= longer  # instead of all depths by its inverse
-        shares.append(_same_surface(points, depth, K, T_b_a, tolerance))
+        shares.append(_same_surface(points, depth, pair.K_b, T_b_a, tolerance))
     return float(np.mean(shares)) if shares else 0.0
 
 

@@ -88,6 +88,11 @@ class FrameFiles(NamedTuple):
     confidence: Picture | None = None
 
 
+CorrectDepth = Callable[
+    [Float[np.ndarray, "h w"], Float[np.ndarray, "3 3"]], Float[np.ndarray, "h w"]
+]
+
+
 @dataclass(frozen=True, eq=False)
 class Sequence:
     """A lazy sequence of frames: `len`, indexing and iteration read one frame at a time.
@@ -111,8 +116,8 @@ class Sequence:
             that of all.
         camera_is_guess: Whether the recording holds no camera, and that of such recordings is
             taken.
-        correct_depth: From a depth image as it is written, in metres, to depth along the optical
-            axis; None where it is written so.
+        correct_depth: From a depth image as it is written, in metres, and its camera matrix to
+            depth along the optical axis; None where it is written so.
     """
 
     layout: str
@@ -128,7 +133,7 @@ class Sequence:
     findings: tuple[Finding, ...] = ()
     cameras: Float[np.ndarray, "n 3 3"] | None = None
     camera_is_guess: bool = False
-    correct_depth: Callable[[Float[np.ndarray, "h w"]], Float[np.ndarray, "h w"]] | None = None
+    correct_depth: CorrectDepth | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -147,12 +152,20 @@ class Sequence:
             color=None if files.color is None else read_color(files.color, self.shape),
             T_world_camera=self.read_pose(index),
             mask=None if files.mask is None else read_mask(files.mask, self.shape),
-            intrinsics=self.intrinsics if self.cameras is None else self.cameras[index],
+            intrinsics=self.camera_of(index),
             time=None if self.times is None else float(self.times[index]),
         )
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[index] for index in range(len(self)))
+
+    def camera_of(self, index: int) -> Float[np.ndarray, "3 3"]:
+        """The camera matrix of one depth image, in pixels.
+
+        Args:
+            index: Number of the frame, from 0.
+        """
+        return self.intrinsics if self.cameras is None else self.cameras[index]
 
     def read_depth(self, index: int) -> Float[np.ndarray, "h w"]:
         """Read the depth image of one frame, and nothing else of it.
@@ -164,7 +177,11 @@ class Sequence:
         depth = read_depth(files.depth, self.shape, depth_scale=self.depth_scale)
         if files.confidence is not None:
             depth = np.where(_read_confident(files.confidence, self.shape), depth, np.float32(0))
-        return depth if self.correct_depth is None else self.correct_depth(depth)
+        return (
+            depth
+            if self.correct_depth is None
+            else self.correct_depth(depth, self.camera_of(index))
+        )
 
 
 # Depth -----------------------------------------------------------------------------------------

@@ -111,7 +111,7 @@ class _Search:
     """Shares of a recording's pairs under conventions, with depth images turned only once."""
 
     def __init__(self, pairs: tuple[Pair, ...], sequence: Sequence, median: float) -> None:
-        self.K, self.own, self.median = sequence.intrinsics, sequence.depth_scale, median
+        self.own, self.median = sequence.depth_scale, median
         self.pairs = pairs
         self.seen: dict[tuple[str, ...], tuple[Seen, ...]] = {}
 
@@ -120,9 +120,9 @@ class _Search:
     ) -> float:
         of_depth = tuple(name for name in names if name in OF_DEPTH)
         if of_depth not in self.seen:
-            self.seen[of_depth] = seen_by(self.pairs, self.K, of_depth)
+            self.seen[of_depth] = seen_by(self.pairs, of_depth)
         seen = self.seen[of_depth]
-        return agreement(seen, self.K, names, longer=longer, tolerance=tolerance)
+        return agreement(seen, names, longer=longer, tolerance=tolerance)
 
     def simple(self, by_columns: bool) -> Iterator[Hypothesis]:
         """Conventions that differ from ours in one thing."""

@@ -1,5 +1,8 @@
 """What the keyframes of a map did not see, in sentences. [host]"""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from jaxshape.data.boxes import Box
@@ -20,6 +23,22 @@ LEGS = 0.15
 _LOWEST = 0.5  # percent of the points that may lie below what counts as measured
 
 
+class Unseen(NamedTuple):
+    """What no keyframe saw of the object.
+
+    Attributes:
+        faces: Names of the faces of its box at which it was not seen to end.
+        below: Share of its height, from below, of which nothing was measured, from 0 to 1.
+    """
+
+    faces: tuple[str, ...] = ()
+    below: float = 0.0
+
+
+ALL_SEEN = Unseen()
+"""Nothing that is known to be unseen, as where a user gave the box."""
+
+
 def doubts_of(progress: Progress) -> tuple[str, ...]:
     """Warnings of frames that cannot be read, and of what was not seen of the object: in keyframes,
     of its box and of its legs.
@@ -30,11 +49,28 @@ def doubts_of(progress: Progress) -> tuple[str, ...]:
     Returns:
         A sentence for each; none about a box that was given.
     """
-    told = (*_unreadable(progress), *_empty(progress))
+    unseen, height = unseen_of(progress), float(progress.start.box.size[1])
+    return (
+        *_unreadable(progress),
+        *_empty(progress),
+        *_of_faces(unseen),
+        *_of_legs(unseen, height),
+    )
+
+
+def unseen_of(progress: Progress) -> Unseen:
+    """What no keyframe saw of the object.
+
+    Args:
+        progress: Progress of a recording.
+
+    Returns:
+        The faces of its box and the share of its height; nothing where the box was given.
+    """
     if progress.start.T_level_world is None:
-        return told
-    views = cutouts(progress.state.keyframes)
-    return (*told, *_unseen(progress.start, views), *_legs(progress.start.box, views))
+        return ALL_SEEN
+    views, box = cutouts(progress.state.keyframes), progress.start.box
+    return Unseen(_faces(progress.start, views), _below(box, views))
 
 
 def _unreadable(progress: Progress) -> tuple[str, ...]:
@@ -60,35 +96,50 @@ def _empty(progress: Progress) -> tuple[str, ...]:
     return (f"No pixel was taken for the object in {_named(names)}; nothing of that is fused.",)
 
 
-def _unseen(start: Start, views: list[Cutout]) -> tuple[str, ...]:
+def _faces(start: Start, views: list[Cutout]) -> tuple[str, ...]:
     """The faces of the box whose place is a guess."""
     faces = faces_of(start.box, views)
     if faces is None:
         return ()
     is_known = faces.seen.copy()
     is_known[0, 1] |= np.isfinite(start.floor)
-    names = [FACES[axis][side] for axis in range(3) for side in (0, 1) if not is_known[side, axis]]
-    if not names:
-        return ()
-    return (
-        f"Where the object ends was not seen at its {_joined(names)}: what the prior expects there "
-        "decides its size. Film it from there too.",
+    return tuple(
+        FACES[axis][side] for axis in range(3) for side in (0, 1) if not is_known[side, axis]
     )
 
 
-def _joined(names: list[str]) -> str:
+def _below(box: Box, views: list[Cutout]) -> float:
+    """Share of the height of the box below all that was measured; 0 where nothing was."""
+    points = in_object(object_points(views), box)
+    if not len(points):
+        return 0.0
+    lowest = float(np.percentile(points[:, 1], _LOWEST)) + box.size[1] / 2
+    return float(np.clip(lowest / box.size[1], 0, 1))
+
+
+def _of_faces(unseen: Unseen) -> tuple[str, ...]:
+    if not unseen.faces:
+        return ()
+    return (
+        f"Where the object ends was not seen at its {joined(unseen.faces)}: what the prior expects "
+        "there decides its size. Film it from there too.",
+    )
+
+
+def joined(names: Sequence[str]) -> str:
+    """Names as a list in a sentence.
+
+    Args:
+        names: The names, one or more.
+    """
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _legs(box: Box, views: list[Cutout]) -> tuple[str, ...]:
+def _of_legs(unseen: Unseen, height: float) -> tuple[str, ...]:
     """Whether everything near the floor is predicted."""
-    points = in_object(object_points(views), box)
-    if not len(points):
-        return ()
-    lowest = float(np.percentile(points[:, 1], _LOWEST)) + box.size[1] / 2
-    if lowest < LEGS * box.size[1]:
+    if unseen.below < LEGS:
         return ()
     return (
-        f"Nothing was measured of its lowest {100 * lowest:.0f} cm: legs, or what else is there, "
-        "are predicted.",
+        f"Nothing was measured of its lowest {100 * unseen.below * height:.0f} cm: legs, or what "
+        "else is there, are predicted.",
     )

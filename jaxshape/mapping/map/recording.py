@@ -20,12 +20,19 @@ from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.mapping.map.cutting import cut_all, cut_new, is_outgrown, parts_in
 from jaxshape.mapping.map.mapper import Mapper, Step
 from jaxshape.mapping.map.state import MapState
-from jaxshape.mapping.placement.finding import Start, on_the_floor, placed_again, room, with_room
+from jaxshape.mapping.placement.finding import (
+    Start,
+    on_the_floor,
+    placed_again,
+    refitted,
+    room,
+    with_room,
+)  # fmt: skip
 from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.reconstruction import Reconstruction
 
-PLACE_AGAIN = (2, 3, 5, 8, 13)
+PLACE_AGAIN = (2, 3, 5, 9)
 """Numbers of keyframes after which the object is placed anew."""
 
 REVISIONS, CHANGED = 2, 0.02
@@ -179,7 +186,8 @@ def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progr
     """The progress with the object's box estimated again, where that is due.
 
     It is due after some keyframes, and where one shows the floor, or more of the object than the
-    box holds. With another box other pixels may be the object, so that it is placed again.
+    box holds. With another box other pixels may be the object, so that it is placed again. After
+    the other keyframes the box is fitted to the faces that they show.
     """
     if progress.start.T_level_world is None:
         return progress
@@ -187,13 +195,23 @@ def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progr
     start = on_the_floor(progress.start, keyframes)
     is_revised = start is not progress.start or is_outgrown(start.box, keyframes)
     if not is_revised and len(keyframes) not in PLACE_AGAIN:
-        return progress
+        return _refitted(progress, mapper)
     for _ in range(REVISIONS):
         keyframes = cut_all(keyframes, with_room(start))
         start = placed_again(start, prior, keyframes)
         pixels = [one.segmented for one in cut_all(keyframes, with_room(start))]
         if _changed(pixels, keyframes) < CHANGED:
             break
+    state, shape = mapper.moved(state, start.box, room=room(start), segmented=pixels)
+    return progress._replace(state=state, start=start, shape=shape)
+
+
+def _refitted(progress: Progress, mapper: Mapper) -> Progress:
+    """The progress with the box where its faces were seen; no search of the prior is needed."""
+    state, start = progress.state, refitted(progress.start, progress.state.keyframes)
+    if start is progress.start:
+        return progress
+    pixels = [one.segmented for one in cut_all(state.keyframes, with_room(start))]
     state, shape = mapper.moved(state, start.box, room=room(start), segmented=pixels)
     return progress._replace(state=state, start=start, shape=shape)
 

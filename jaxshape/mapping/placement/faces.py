@@ -26,6 +26,9 @@ BEYOND = 0.05
 PADDING = 0.005
 """Metres between the last measured points and a face that was seen."""
 
+FIT = 0.02
+"""Metres by which a face may lie apart from where the object was seen to end."""
+
 CLEAR = 0.02
 """Metres in front of what a ray met at which it has surely passed."""
 
@@ -123,6 +126,18 @@ def fitted(box: Box, faces: Faces | None) -> Box:
     if len(box.exclude):  # its bottom stands on the floor
         lower[1] = -half[1]
     return between(box, lower, upper)
+
+
+def fits(box: Box, faces: Faces | None) -> bool:
+    """Whether the box ends where the object was seen to end, to `FIT`.
+
+    Args:
+        box: The object's box.
+        faces: The ends of the object along its axes; None where nothing was measured.
+    """
+    fitting = fitted(box, faces)
+    moved = (fitting.T_world_object[:3, 3] - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
+    return bool((np.abs(moved) + np.abs(fitting.size - box.size) / 2 < FIT).all())
 
 
 def between(box: Box, lower: Float[np.ndarray, " 3"], upper: Float[np.ndarray, " 3"]) -> Box:

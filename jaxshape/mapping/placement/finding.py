@@ -2,6 +2,7 @@
 
 find_start     which frame, which pixels, and where the object stands in the world
 on_the_floor   the same, once a later keyframe shows the floor
+refitted       the same, once later keyframes show where it ends
 placed_again   the same box, estimated from all keyframes so far
 """
 
@@ -20,6 +21,7 @@ from jaxshape.mapping.placement.faces import (
     between,
     cutouts,
     faces_of,
+    fits,
     fitted,
     object_points,
     tallest,
@@ -363,6 +365,25 @@ def _standing_on(start: Start, floor: Plane) -> Start:
         warnings=kept,
     )
     return _in_box(start, _without_floor(between(box, lower, upper), height))
+
+
+# A face that is seen later -----------------------------------------------------------------------
+
+
+def refitted(start: Start, keyframes: tuple[Keyframe, ...]) -> Start:
+    """The start with its box fitted to where the keyframes saw the object end.
+
+    Args:
+        start: The object, with its latest box.
+        keyframes: The keyframes of the map.
+
+    Returns:
+        The start; the same one where its box fits.
+    """
+    faces = faces_of(start.box, cutouts(keyframes))
+    if start.placement is None or fits(start.box, faces):
+        return start
+    return _in_box(start, fitted(start.box, faces))
 
 
 # Placement --------------------------------------------------------------------------------------

@@ -182,6 +182,20 @@ def write_npz(folder, seen):
     )
 
 
+def write_icl_nuim(folder, seen):
+    """Its own y axes point up, in the camera and in the world; the images do not."""
+    mirror, lines = np.diag([1.0, -1.0, 1.0, 1.0]), []
+    for i, T in enumerate(seen.T_world_camera):
+        save(folder / f"depth/{i}.png", raw(seen.depth[i], 5000))
+        save(folder / f"rgb/{i}.png", seen.color[i])
+        theirs = mirror @ T @ mirror
+        numbers = [i, *theirs[:3, 3], *Rotation.from_matrix(theirs[:3, :3]).as_quat()]
+        lines.append(" ".join(map(repr, map(float, numbers))))
+    (folder / "associations.txt").write_text("0 depth/0.png 0 rgb/0.png\n")
+    (folder / "livingRoom1.gt.freiburg").write_text("\n".join(lines) + "\n")
+    np.savetxt(folder / "cam_K.txt", seen.opencv[0])
+
+
 def save_float_tiff(path, depth):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(depth.astype(np.float32)).save(path)
@@ -195,6 +209,7 @@ WRITERS = {
     "record3d": write_record3d,
     "nerfstudio": write_nerfstudio,
     "replica": write_replica,
+    "icl-nuim": write_icl_nuim,
     "npz": write_npz,
 }
 OWN_CAMERAS = ("bop", "stray-scanner", "record3d", "nerfstudio", "npz")

@@ -1,6 +1,7 @@
 """What phones, datasets and renderers write is read as it was seen, with their own conventions."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from device_recordings import (
 from recordings import OPENCV, H, W, raw, save
 
 from jaxshape.data.sequences import LAYOUTS, SequenceError, open_sequence
+from jaxshape.data.sequences.evidence import agreement, seen_by, telling_pairs
 
 SEEN = shoot()
 
@@ -82,6 +84,15 @@ def test_each_frame_has_the_camera_it_was_taken_with(tmp_path, name):
     assert share_seen_again(frames[0], frames[4]) > 0.9
     alike = frames[4]._replace(intrinsics=frames[0].intrinsics)
     assert share_seen_again(frames[0], alike) < 0.5
+
+
+def test_poses_agree_with_depth_by_the_camera_of_each_frame(tmp_path):
+    """The focal length doubles within the film."""
+    WRITERS["npz"](tmp_path, shoot(9, zoom=0.12))
+    sequence = open_sequence(tmp_path)
+    assert agreement(seen_by(telling_pairs(sequence))) > 0.9
+    alike = replace(sequence, cameras=None)
+    assert agreement(seen_by(telling_pairs(alike))) < 0.75
 
 
 @pytest.mark.parametrize("name", WRITERS)

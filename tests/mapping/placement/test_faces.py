@@ -7,7 +7,14 @@ from analytic_room import CHAIR, FLOOR, K, look_from, room
 
 from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.geometry.camera import intrinsics_of
-from jaxshape.mapping.placement.faces import Cutout, between, faces_of, fitted, reach_of
+from jaxshape.mapping.placement.faces import (
+    Cutout,
+    between,
+    faces_of,
+    fits,
+    fitted,
+    reach_of,
+)
 
 TRUE = np.array([[-0.22, 0, -0.22], [0.22, 0.95, 0.22]])
 """Lowest and highest corner of the chair."""
@@ -40,6 +47,16 @@ def test_a_chair_seen_from_all_around_ends_where_it_does(error):
     assert faces is not None and faces.seen[:, [0, 2]].all() and faces.seen[1, 1]
     np.testing.assert_allclose(corners(fitted(box, faces))[:, [0, 2]], TRUE[:, [0, 2]], atol=0.025)
     assert corners(fitted(box, faces))[1, 1] == pytest.approx(0.95, abs=0.025)
+
+
+def test_a_box_fits_until_a_face_is_seen_elsewhere_than_it_lies():
+    deep = box_of(TRUE[0] - [0, 0, 0.08], TRUE[1])
+    front, everywhere = [view(AROUND[0])], [view(eye) for eye in AROUND]
+    assert not fits(deep, faces_of(deep, everywhere))
+    faces = faces_of(deep, front)
+    assert faces is not None and not faces.seen[0, 2]
+    right = fitted(deep, faces_of(deep, everywhere))
+    assert fits(right, faces_of(right, everywhere)) and fits(right, None)
 
 
 def test_a_face_that_nobody_saw_stays_where_the_prior_put_it():

@@ -1,0 +1,262 @@
+r"""Seats in a room, filmed by hand from close up: is the whole seat found, and is it said if not?
+
+    python experiments/hand_held.py --meshes cad_chairs/
+
+Each seat stands on a floor, before a wall, with a table beside it. The camera begins so close that
+the legs are out of view, moves back and then around, a little shaken, with a Kinect's noise; its
+poses are given, and one click shows the seat in the first frame. A seat is whole where all four
+sides of its box lie within 4 cm of the truth; a result is wrong where they, or its height, do not,
+and nothing may be wrong without a warning or a verdict other than good.
+
+Results: experiments/results/hand_held.json, seat by seat: a run that was killed goes on.
+"""
+
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import trimesh
+import tyro
+from PIL import Image
+
+from jaxshape.data import meshes
+from jaxshape.data.boxes import Box
+from jaxshape.data.render import add_sensor_noise, render_depth
+from jaxshape.data.sequences import open_sequence
+from jaxshape.files import write_json
+from jaxshape.geometry.camera import Intrinsics
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.map.doubts import doubts_of, unseen_of
+from jaxshape.mapping.map.mapper import Mapper, build_mapper
+from jaxshape.mapping.map.recording import Progress, follow
+from jaxshape.mapping.placement.finding import find_start
+from jaxshape.mapping.segmentation.segment import Prompt
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import load_prior
+from jaxshape.process import prepare_process
+from jaxshape.results.output import only, shape_mesh
+from jaxshape.results.progress import floor_height, observation_of, seen_views
+from jaxshape.results.verdict import judged, quality_of
+from jaxshape.search.config import RefineConfig
+
+RESULTS = Path(__file__).parent / "results"
+WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
+NEAR = 0.04
+"""Metres within which a side of the box is right."""
+T_WORLD_OBJECT = np.array([[0, 0, 1, 2], [0, 1, 0, 1], [-1, 0, 0, -3], [0, 0, 0, 1]], float)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the experiment."""
+
+    meshes: Path = Path("cad_chairs")
+    """Folder or archive of seats, +y up and +z in front."""
+    seats: int = 24
+    """How many of them, spread over all."""
+    frames: int = 12
+    results: Path = RESULTS
+    smoke: bool = False
+    """One seat, few frames: does it run?"""
+
+
+def main(config: Config) -> None:
+    prepare_process()
+    if config.smoke:
+        config = replace(config, seats=1, frames=3)
+    metrics = run(config)
+    for name, one in metrics["seats"].items():
+        print(name[:40].ljust(40), _row(one))
+    print(metrics["summary"])
+
+
+def _row(one: dict[str, Any]) -> str:
+    sides = " ".join(f"{100 * x:+.0f}" for x in one["sides"])
+    return f"sides [{sides}] cm  {one['verdict']}, {len(one['warnings'])} warnings"
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Rebuild every seat, going on from earlier results of the same settings."""
+    path = config.results / "hand_held.json"
+    settings = {"seats": config.seats, "frames": config.frames, "meshes": config.meshes.name}
+    done = _earlier(path, settings)
+    placer, prior = load_prior("chair-autoencoder"), load_prior()
+    mapper = build_mapper(prior, None, RefineConfig(), MappingConfig(), TrackingConfig())
+    for source in _chosen(config):
+        if source.name not in done:
+            done[source.name] = _rebuilt(source, config.frames, mapper, placer)
+            write_json(path, {"settings": settings, "summary": summary(done), "seats": done})
+            print(source.name, _row(done[source.name]), flush=True)
+    return {"settings": settings, "summary": summary(done), "seats": done}
+
+
+def _earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    earlier = json.loads(path.read_text()) if path.is_file() else {}
+    return earlier["seats"] if earlier.get("settings") == settings else {}
+
+
+def _chosen(config: Config) -> Iterator[meshes.MeshSource]:
+    sources = meshes.list_meshes(config.meshes)
+    count = min(config.seats, len(sources))
+    yield from (sources[i] for i in np.linspace(0, len(sources) - 1, count).round().astype(int))
+
+
+def summary(seats: dict[str, Any]) -> dict[str, int]:
+    """How many seats are whole, and how many results are wrong, with and without a word of it."""
+    wrong = [one for one in seats.values() if np.abs(one["sides"]).max() > NEAR]
+    return {
+        "seats": len(seats),
+        "whole": sum(_is_whole(one["sides"]) for one in seats.values()),
+        "wrong": len(wrong),
+        "wrong and not said": sum(
+            not one["warnings"] and one["verdict"] == "good" for one in wrong
+        ),
+        "right and good": sum(
+            one["verdict"] == "good" for one in seats.values() if one not in wrong
+        ),
+    }
+
+
+def _is_whole(sides: list[float]) -> bool:
+    return all(abs(sides[i]) < NEAR for i in (0, 2, 3, 5))
+
+
+# One seat ---------------------------------------------------------------------------------------
+
+
+class Recorded(NamedTuple):
+    """A recording on disk, and the truth of it."""
+
+    folder: Path
+    click: tuple[float, float]
+    middle: np.ndarray
+    size: np.ndarray
+
+
+def _rebuilt(
+    source: meshes.MeshSource, frames: int, mapper: Mapper, placer: ShapePrior
+) -> dict[str, Any]:
+    model = meshes.load(source)
+    assert isinstance(model, meshes.Model), model
+    began = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        seen = record(Path(folder), model.mesh, frames, seed=len(source.name))
+        sequence = open_sequence(seen.folder)
+        start = find_start(sequence, placer, Prompt(click=seen.click))
+        *_, progress = follow(sequence, start, mapper, placer, use_poses=True)
+        state, shape = mapper.finish(progress.state)
+    progress = progress._replace(state=state, shape=shape)
+    return {
+        "sides": sides_of(progress.start.box, seen).round(4).tolist(),
+        "size": progress.start.box.size.round(4).tolist(),
+        "true_size": seen.size.round(4).tolist(),
+        "warnings": [*progress.start.warnings, *doubts_of(progress)],
+        **_judged(progress),
+        "cpu_seconds": round(time.process_time() - began, 1),
+    }
+
+
+def sides_of(box: Box, seen: Recorded) -> np.ndarray:
+    """Offsets of the ends of the box from the true ones: three lower, three upper, in metres."""
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3) * box.size
+    world = corners @ box.T_world_object[:3, :3].T + box.T_world_object[:3, 3]
+    found = (world - T_WORLD_OBJECT[:3, 3]) @ T_WORLD_OBJECT[:3, :3] - seen.middle
+    lower, upper = found.min(axis=0) + seen.size / 2, found.max(axis=0) - seen.size / 2
+    return np.concatenate([lower, upper])
+
+
+def _judged(progress: Progress) -> dict[str, Any]:
+    observation = observation_of(progress.state)
+    one = only(progress.shape)
+    found = shape_mesh(observation, one.composed, one.fill_logits)
+    quality = quality_of(
+        found.mesh,
+        found.measured,
+        seen_views(progress.state),
+        axial=observation.sensor.axial,
+        is_mirrored=bool(one.symmetric),
+        floor=floor_height(progress.start),
+        unseen=unseen_of(progress),
+    )
+    verdict = judged(quality)
+    figures = {k: v for k, v in quality._asdict().items() if k != "size"}
+    return {"verdict": verdict.word, "reasons": verdict.reasons, "quality": figures}
+
+
+# The recording ----------------------------------------------------------------------------------
+
+
+def record(folder: Path, mesh: trimesh.Trimesh, frames: int, seed: int) -> Recorded:
+    """Film a seat in its room, and write it in the 7-Scenes layout."""
+    rng = np.random.default_rng(seed)
+    T = _path(mesh.bounds, frames, rng)
+    poses = jaxlie.SE3.from_matrix(jnp.float32(T))
+    lens = Intrinsics(*jnp.float32([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]))
+    depth, cosine = render_depth(_in_a_room(mesh), poses, lens, (HEIGHT, WIDTH))
+    alone, _ = render_depth(mesh, jaxlie.SE3(poses.wxyz_xyz[:1]), lens, (HEIGHT, WIDTH))
+    shown = np.isfinite(alone[0]) & (alone[0] < depth[0] + 1e-4)
+    depth = add_sensor_noise(depth, cosine, rng)
+    millimetres = np.where(np.isfinite(depth), np.rint(1000 * depth), 0).clip(0, 65534)
+    for i, image in enumerate(millimetres.astype(np.uint16)):
+        Image.fromarray(image).save(folder / f"frame-{i:06d}.depth.png")
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", T_WORLD_OBJECT @ T[i])
+    K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
+    np.savetxt(folder / "camera-intrinsics.txt", K)
+    row, column = np.nonzero(shown)
+    middle = np.argmin(np.hypot(row - np.median(row), column - np.median(column)))
+    click = float(column[middle]) + 0.5, float(row[middle]) + 0.5
+    return Recorded(folder, click, mesh.bounds.mean(axis=0), np.asarray(mesh.extents, float))
+
+
+def _in_a_room(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The seat with a floor, a wall 0.9 m behind it and a table 12 cm beside it."""
+    (_, floor, behind), (right, _, _) = mesh.bounds
+    near, far = right + 0.12, right + 1.12
+    boxes = [
+        ((-3, floor - 0.1, -3), (4, floor, 4)),
+        ((-3, floor, behind - 1), (4, floor + 2.5, behind - 0.9)),
+        ((near, floor + 0.7, -0.45), (far, floor + 0.74, 0.45)),
+        *(
+            ((x - 0.03, floor, z - 0.03), (x + 0.03, floor + 0.7, z + 0.03))
+            for x in (near + 0.06, far - 0.06)
+            for z in (-0.39, 0.39)
+        ),
+    ]
+    room = [trimesh.creation.box(bounds=np.array(corners, float)) for corners in boxes]
+    return trimesh.util.concatenate([mesh, *room])
+
+
+def _path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarray:
+    """Camera poses: close to the upper part, back until all is in view, and 110 degrees around."""
+    middle, (width, height, depth) = bounds.mean(axis=0), np.ptp(bounds, axis=0)
+    radius = np.linalg.norm([width, height, depth]) / 2
+    along = np.linspace(0, 1, frames)
+    away = np.minimum(1, along / 0.45)
+    azimuth = np.deg2rad(rng.uniform(-20, 45) - 110 * along**1.3)
+    distance = radius + 0.45 + away * (1 + 0.15 * np.sin(5 * along))
+    eye = np.stack([distance * np.sin(azimuth), 0 * along, distance * np.cos(azimuth)], axis=1)
+    eye[:, 1] = bounds[0, 1] + 0.8 * height + 0.35 + 0.35 * away - middle[1]
+    target = np.stack([0 * along, bounds[0, 1] + height * (0.85 - 0.38 * away) - middle[1],
+                       0 * along], axis=1)  # fmt: skip
+    eye, target = eye + rng.normal(0, 0.01, eye.shape), target + rng.normal(0, 0.02, eye.shape)
+    return np.stack([_look_from(middle + a, middle + b) for a, b in zip(eye, target, strict=True)])
+
+
+def _look_from(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0, 1, 0))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    return T
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,180 @@
+"""What commands say about a folder of meshes before they use it: units, axes, what is left out."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxshape.cli.common import (
+    console,
+    named,
+    progress_bar,
+    report_notes,
+    report_skipped,
+    require,
+    warn,
+)
+from jaxshape.cli.options import Axes
+
+SAMPLE = 200
+"""Meshes that are looked at where not all of them need be."""
+
+VOTERS = 12
+"""Meshes that vote on the axes: each takes about a second."""
+
+
+def find_meshes(path: Path) -> list[Any]:
+    """The meshes (`MeshSource`) at a path; says what else there was."""
+    from jaxshape.data.archives import list_meshes, passed_over
+
+    sources = list_meshes(path)
+    if others := passed_over(path):
+        counts = ", ".join(f"{count} {suffix}" for suffix, count in others.most_common())
+        console.print(f"[yellow]passed over[/] {counts}: not read here.", highlight=False)
+    return sources
+
+
+def look_at(sources: Sequence[Any], axes: Axes, workers: int | None = None) -> list[Any]:
+    """What is known of each mesh (`Surveyed`), with a bar, and a warning where sizes are odd."""
+    from jaxshape.data.survey import doubted_size, survey
+
+    found: list[Any] = [None] * len(sources)
+    with progress_bar("meshes") as bar:
+        task = bar.add_task("check", total=len(sources), note="")
+        for number, one in survey(
+            sources, up=axes.up, front=axes.front, unit=axes.unit, workers=workers
+        ):
+            found[number] = one
+            bar.update(task, advance=1)
+    sizes = [one.size for one in found if one.skipped is None]
+    if doubt := doubted_size(sizes, axes.unit):
+        warn(doubt)
+    return found
+
+
+def load_models(
+    sources: Sequence[Any], axes: Axes, *, refuse: bool = True
+) -> tuple[list[Any], list[Any]]:
+    """The meshes (`Model`) that can be used, and those `Skipped`; it may refuse to use none."""
+    from jaxshape.data.dataset import load_object
+    from jaxshape.data.meshes import Skipped
+    from jaxshape.data.survey import doubted_size
+
+    with progress_bar("meshes") as bar:
+        task = bar.add_task("read", note="")
+        watched = bar.track(sources, task_id=task)
+        found = [
+            load_object(source, up=axes.up, front=axes.front, unit=axes.unit) for source in watched
+        ]
+    skipped = [f for f in found if isinstance(f, Skipped)]
+    models = [f for f in found if not isinstance(f, Skipped)]
+    report_skipped(skipped)
+    report_notes((model.name, note) for model in models for note in model.notes)
+    require(
+        bool(models) or not refuse,
+        f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
+        f"{skipped[0].reason}. {skipped[0].detail}"
+        if skipped
+        else "",
+    )
+    if doubt := doubted_size([float(model.mesh.scale) for model in models], axes.unit):
+        warn(doubt)
+    return models, skipped
+
+
+# ------------------------------------------------------------------ axes
+
+
+def turned(sources: Sequence[Any], axes: Axes, prior: Any = None) -> list[Any]:
+    """The meshes, each with the axes that it seems to have, where --axes auto asks for that."""
+    if axes.axes == "given":
+        return list(sources)
+    from jaxshape.model.facing import dissenting, usual_axes
+
+    scores = _scores(sources, axes, prior)
+    if not scores:
+        warn("These are no seats, the only things that --axes auto knows; --up and --front hold.")
+        return list(sources)
+    usual = usual_axes(scores, (axes.up, axes.front))
+    others = dissenting(scores, usual)
+    kept = len(sources) - len(others)
+    console.print(f"{_flags(usual)} for {kept} meshes, other axes for {len(others)}.")
+    return [source._replace(axes=others.get(source.name, usual)) for source in sources]
+
+
+def check_axes(
+    sources: Sequence[Any],
+    lying: Sequence[str],
+    axes: Axes,
+    *,
+    prior: Any = None,
+    refuse: bool = False,
+) -> None:
+    """Warn where the axes of a collection seem wrong, or differ within it.
+
+    `lying` names the meshes that seem to lie on their side. Those of which most meshes do are
+    refused, where it is certain that they are seats.
+    """
+    from jaxshape.data.survey import evenly
+    from jaxshape.model.facing import dissenting, usual_axes
+
+    if axes.axes == "auto":
+        return
+    given, count = (axes.up, axes.front), len(sources)
+    if 2 * len(lying) > count:
+        scores = _scores(evenly(sources, VOTERS), axes, prior)
+        if not scores and not refuse:  # these are no seats
+            return
+        standing = usual_axes(scores, ("z", "-y"))
+        complaint = (
+            f"{len(lying)} of {count} meshes seem to lie on their side, {lying[0]!r} for one{{}}; "
+            f"name the axis that points up, for example {_flags(standing)}."
+        )
+        require(not refuse, complaint.format(""))
+        return warn(complaint.format(", if they are seats"))
+    if lying:
+        warn(
+            f"{len(lying)} of {count} meshes seem to lie on their side, if they are seats: "
+            f"{named(lying)}; --axes auto turns each of them."
+        )
+    upright = [source for source in sources if source.name not in lying]
+    scores = _scores(evenly(upright, VOTERS), axes, prior, ups=(axes.up,))
+    usual = usual_axes(scores, given)
+    others = dissenting(scores, given)
+    if usual != given and 2 * len(others) > len(scores):
+        warn(
+            f"{len(others)} of {len(scores)} meshes that were looked at seem to face another way, "
+            f"{next(iter(others))!r} for one; give {_flags(usual)}."
+        )
+    elif others:
+        warn(
+            f"{len(others)} of {len(scores)} meshes that were looked at seem to face another way "
+            f"than the rest: {named(list(others))}; --axes auto turns each of them."
+        )
+
+
+def _flags(pair: tuple[str, str]) -> str:
+    return f"--up {pair[0]} --front {pair[1]}"
+
+
+def _scores(
+    sources: Sequence[Any], axes: Axes, prior: Any, ups: tuple[str, ...] | None = None
+) -> dict[str, Any]:
+    """How well each pair of axes of the files fits each mesh; empty where nothing is known of their
+    kind: `prior` knows its own, the weights for chairs know seats."""
+    from jaxshape.data.meshes import Skipped, load, resembles_a_seat
+    from jaxshape.model.facing import are_known, facing_scores
+    from jaxshape.model.weights import load_prior
+
+    loaded = [load(source, unit=axes.unit) for source in sources]
+    models = [model for model in loaded if not isinstance(model, Skipped)]
+    may_be_seats = [model for model in models if resembles_a_seat(model.mesh)]
+    if prior is None and 2 * len(may_be_seats) <= len(models):
+        return {}
+    known = load_prior(None) if prior is None else prior
+    with progress_bar("meshes") as bar:
+        task = bar.add_task("axes", note="")
+        scores = {
+            model.name: facing_scores(known, model.mesh, ups)
+            for model in bar.track(models, task_id=task)
+        }
+    return scores if prior is not None or are_known(scores) else {}

@@ -1,0 +1,260 @@
+"""Build a dataset, object by object, in processes that may die. [host]
+
+Each object that is made, or skipped, leaves a part in `parts/`: its arrays, and a record that comes
+last. When all objects of a shard are there, their parts become the shard. A killed build so loses
+only the objects it was at.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxshape.data import dataset, meshes
+from jaxshape.data.archives import MeshSource
+from jaxshape.data.config import DatasetConfig
+from jaxshape.data.dataset import (
+    FORMAT,
+    KINDS,
+    OBJECTS_PER_SHARD,
+    DatasetError,
+    Object,
+    hash_seed,
+    load_object,
+    shard_path,
+)
+from jaxshape.data.meshes import Skipped
+from jaxshape.data.pool import in_processes
+from jaxshape.files import atomic_path, write_json
+
+NOTHING = (
+    "The virtual camera measured nothing of it along a whole path: it is too thin, or too far."
+)
+
+
+class BuildProgress(NamedTuple):
+    """Progress of a build.
+
+    Attributes:
+        objects: Objects that are done, skipped ones included.
+        total: Objects in all.
+        skipped: Objects that could not be used.
+        notes: Names of objects, and what their files held besides.
+    """
+
+    objects: int
+    total: int
+    skipped: list[Skipped]
+    notes: list[tuple[str, str]]
+
+    def after(
+        self, objects: int, skipped: list[Skipped], notes: list[tuple[str, str]]
+    ) -> "BuildProgress":
+        """The progress with some more objects."""
+        done = self.objects + objects
+        return BuildProgress(done, self.total, self.skipped + skipped, self.notes + notes)
+
+    def after_one(self, record: "Record") -> "BuildProgress":
+        """The progress with one more object."""
+        skipped = [record.skipped] if record.skipped else []
+        return self.after(1, skipped, [(record.name, note) for note in record.notes])
+
+
+class Record(NamedTuple):
+    """What became of one object.
+
+    Attributes:
+        name: Its name.
+        content: Digest of its file; empty for a procedural object.
+        notes: What its file held besides.
+        skipped: Why it could not be used; None where it could.
+    """
+
+    name: str
+    content: str
+    notes: tuple[str, ...]
+    skipped: Skipped | None
+
+
+def build_dataset(
+    folder: str | os.PathLike[str],
+    objects: Sequence[Object],
+    config: DatasetConfig = DatasetConfig(),
+    *,
+    workers: int | None = None,
+) -> Iterator[BuildProgress]:
+    """Make the missing objects of a dataset in parallel processes.
+
+    A shard with an object whose file has changed since is made anew.
+
+    Args:
+        folder: Folder of the dataset; made if missing.
+        objects: Procedural objects, or meshes.
+        config: Settings of the dataset.
+        workers: Processes, 1 or more; None for one for each CPU core.
+
+    Yields:
+        The progress, at first and after each object.
+
+    Raises:
+        DatasetError: The folder holds a dataset of other objects or settings.
+        WorkersDied: Processes end before they begin.
+    """
+    folder = Path(folder)
+    _claim(folder, objects, config)
+    starts = range(0, len(objects), OBJECTS_PER_SHARD)
+    shards = [objects[start : start + OBJECTS_PER_SHARD] for start in starts]
+    progress, missing = BuildProgress(0, len(objects), [], []), []
+    done: dict[int, dict[int, Record]] = {}
+    for shard, items in enumerate(shards):
+        if (found := _finished(folder, shard, items)) is not None:
+            progress = progress.after(len(items), *found)
+            continue
+        done[shard] = {}
+        for number, item in enumerate(items, shard * OBJECTS_PER_SHARD):
+            record = _read_part(folder, number)
+            if record is not None and record.content in ("", content_of(item)):
+                done[shard][number] = record
+                progress = progress.after_one(record)
+            else:
+                missing.append((number, item))
+    yield progress
+    for shard, known in done.items():  # a build may be killed between its last part and its shard
+        if len(known) == len(shards[shard]):
+            _write_shard(folder, config, shard, known)
+    make = partial(_make_part, folder, config)
+    for place, died in in_processes(make, missing, workers or os.cpu_count() or 1):
+        number, item = missing[place]
+        shard = number // OBJECTS_PER_SHARD
+        if died is not None:
+            _skip(folder, number, item, "killed", str(died))
+        record = _read_part(folder, number)
+        assert record is not None
+        done[shard][number] = record
+        if len(done[shard]) == len(shards[shard]):
+            _write_shard(folder, config, shard, done.pop(shard))
+        progress = progress.after_one(record)
+        yield progress
+
+
+def content_of(item: Object) -> str:
+    """Digest of the content of an object's file; empty where there is no file, or none to read.
+
+    Args:
+        item: The object.
+    """
+    try:
+        return meshes.digest(item) if isinstance(item, MeshSource) else ""
+    except Exception:  # archives and folders fail in any way there is
+        return ""
+
+
+def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> None:
+    names = [item.name for item in objects]
+    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
+    settings = json.loads(json.dumps(asdict(config)))
+    claim = {"format": FORMAT, "config": settings, "objects": len(names), "names_sha256": digest}
+    path = folder / "dataset.json"
+    if not path.exists():
+        return write_json(path, claim)
+    found = json.loads(path.read_text())
+    # Datasets of before there was a setting have what is its default now.
+    known = {"config": json.loads(json.dumps(asdict(DatasetConfig()))) | found.get("config", {})}
+    if found | known != claim:
+        raise DatasetError(
+            f"{str(folder)!r} already holds a dataset of other objects or settings; "
+            "give another folder, or remove this one."
+        )
+
+
+# ------------------------------------------------------------------ parts
+
+
+def _part_path(folder: Path, number: int, suffix: str) -> Path:
+    return folder / "parts" / f"{number:08d}.{suffix}"
+
+
+def _make_part(folder: Path, config: DatasetConfig, numbered: tuple[int, Object]) -> None:
+    """Film one object along its paths."""
+    number, item = numbered
+    model = load_object(item, up=config.up, front=config.front, unit=config.unit)
+    if isinstance(model, Skipped):
+        return _skip(folder, number, item, model.reason, model.detail)
+    made = dataset.object_paths(model.mesh, config, hash_seed(config.seed, number))
+    if made is None:
+        return _skip(folder, number, item, "nothing measured", NOTHING)
+    with atomic_path(_part_path(folder, number, "npz")) as path:
+        np.savez(path, **dict(zip(KINDS, made, strict=True)))
+    _write_part(folder, number, Record(model.name, model.digest, model.notes, None))
+
+
+def _skip(folder: Path, number: int, item: Object, reason: str, detail: str) -> None:
+    skipped = Skipped(item.name, reason, detail)
+    _write_part(folder, number, Record(item.name, content_of(item), (), skipped))
+
+
+def _write_part(folder: Path, number: int, record: Record) -> None:
+    write_json(_part_path(folder, number, "json"), record)
+
+
+def _read_part(folder: Path, number: int) -> Record | None:
+    path = _part_path(folder, number, "json")
+    if not path.exists():
+        return None
+    name, content, notes, skipped = json.loads(path.read_text())
+    return Record(name, content, tuple(notes), skipped and Skipped(*skipped))
+
+
+# ------------------------------------------------------------------ shards
+
+
+def _write_shard(
+    folder: Path, config: DatasetConfig, shard: int, records: dict[int, Record]
+) -> None:
+    """Put the parts of a shard together, and remove them."""
+    numbers = sorted(records)
+    made = [number for number in numbers if records[number].skipped is None]
+    voxels = config.resolution**3
+    shapes = (config.paths, voxels // 8), (config.paths, len(config.frames), voxels)
+    for kind, shape in zip(KINDS, shapes, strict=True):
+        with atomic_path(shard_path(folder, shard, f"{kind}.npy")) as path:
+            rows = np.lib.format.open_memmap(path, "w+", np.uint8, (len(made), *shape))
+            for row, number in enumerate(made):
+                with np.load(_part_path(folder, number, "npz")) as arrays:
+                    rows[row] = arrays[kind]
+            rows.flush()
+    # The names come last: a shard counts as written once they are there.
+    content = {
+        "names": [records[number].name for number in made],
+        "skipped": [records[number].skipped for number in numbers if records[number].skipped],
+        "contents": [records[number].content for number in numbers],
+        "notes": [(records[n].name, note) for n in numbers for note in records[n].notes],
+    }
+    write_json(shard_path(folder, shard, "json"), content)
+    for number in numbers:
+        for suffix in ("npz", "json"):
+            _part_path(folder, number, suffix).unlink(missing_ok=True)
+    if not any((folder / "parts").iterdir()):
+        (folder / "parts").rmdir()
+
+
+def _finished(
+    folder: Path, shard: int, items: Sequence[Object]
+) -> tuple[list[Skipped], list[tuple[str, str]]] | None:
+    """What was skipped of a shard, and its notes; None where it is to be made."""
+    path = shard_path(folder, shard, "json")
+    if not path.exists():
+        return None
+    found = json.loads(path.read_text())
+    contents = found.get("contents", [""] * len(items))  # datasets of before there were contents
+    if any(content not in ("", content_of(item))
+           for content, item in zip(contents, items, strict=True)):  # fmt: skip
+        path.unlink()
+        return None
+    return [Skipped(*one) for one in found["skipped"]], [(a, b) for a, b in found.get("notes", [])]

@@ -1,0 +1,240 @@
+"""glTF 2.0: every triangle of the scene that a viewer would show, in its resting pose."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxshape.data.formats.gltf_data import GltfFile, draco_mesh, open_gltf
+from jaxshape.data.formats.parts import NotSupported, Part, Unreadable, check_faces, checked
+from jaxshape.data.formats.ply import strip_triangles
+
+UNDERSTOOD = {
+    "KHR_draco_mesh_compression", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
+    "KHR_node_visibility",
+}  # fmt: skip
+"""Extensions that change shapes, and are read."""
+
+HARMLESS = (
+    "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "MSFT_packing_",
+    "KHR_lights_", "EXT_lights_", "KHR_xmp", "KHR_animation_", "AGI_", "EXT_materials_",
+    "ADOBE_materials_", "KHR_audio", "KHR_node_hoverability", "KHR_node_selectability",
+    "KHR_interactivity", "CESIUM_primitive_outline", "EXT_structural_metadata",
+)  # fmt: skip
+"""Beginnings of the names of extensions that leave shapes as they are."""
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_NO_SURFACE = (0, 1, 2, 3)
+"""Modes of points and lines."""
+
+Matrix = Float[np.ndarray, "4 4"]
+
+
+def read_gltf(content: bytes, beside: Callable[[str], bytes]) -> list[Part]:
+    """The triangles of a `.gltf` or `.glb` file, one part for each primitive of each node.
+
+    Args:
+        content: All of the file.
+        beside: Reads a file by its path relative to this one.
+
+    Raises:
+        Unreadable: The file is damaged.
+        NotSupported: It needs an extension that is not read here.
+        TooManyFaces: There are too many triangles.
+    """
+    file = open_gltf(content, beside)
+    for name in file.list("extensionsRequired"):
+        if name not in UNDERSTOOD and not name.startswith(HARMLESS):
+            raise NotSupported(f"The file needs the glTF extension {name}; export it without.")
+    placed = _matrices(file)
+    meshes: dict[Any, list[Part]] = {}
+    parts, faces = [], 0
+    for index, names in _shown(file):
+        node = file.list("nodes")[index]
+        if "mesh" not in node:
+            continue
+        key = index if "skin" in node or "weights" in node else ("mesh", node["mesh"])
+        if key not in meshes:
+            meshes[key] = list(_primitives(file, node, placed))
+        copies = (
+            [np.eye(4)]
+            if "skin" in node
+            else [placed[index] @ instance for instance in _instances(file, node)]
+        )
+        faces += len(copies) * sum(len(part.faces) for part in meshes[key])
+        check_faces(faces)
+        parts += [_moved(part, names, matrix) for part in meshes[key] for matrix in copies]
+    return parts
+
+
+# ------------------------------------------------------------------ nodes
+
+
+def _matrices(file: GltfFile) -> list[Matrix]:
+    """From the frame of each node to that of the scene."""
+    nodes = file.list("nodes")
+    parents: dict[int, int] = {}
+    for i, node in enumerate(nodes):
+        for child in node.get("children", []):
+            if child in parents or not 0 <= child < len(nodes):
+                raise Unreadable(f"Node {child} is the child of two nodes, or is not there.")
+            parents[child] = i
+    placed = [_matrix(node) for node in nodes]
+    waiting = [i for i in range(len(nodes)) if i not in parents]
+    seen = 0
+    while waiting:
+        index = waiting.pop()
+        seen += 1
+        for child in nodes[index].get("children", []):
+            placed[child] = placed[index] @ placed[child]
+            waiting.append(child)
+    if seen < len(nodes):
+        raise Unreadable("Some nodes are children of their own children.")
+    return placed
+
+
+def _matrix(node: dict[str, Any]) -> Matrix:
+    """From the frame of a node to that of its parent."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    return _transform(
+        node.get("translation", (0, 0, 0)),
+        node.get("rotation", (0, 0, 0, 1)),
+        node.get("scale", (1, 1, 1)),
+    )
+
+
+def _transform(translation: Any, xyzw: Any, scale: Any) -> Matrix:
+    """Scale, then turn, then move."""
+    x, y, z, w = np.asarray(xyzw, np.float64) / (np.linalg.norm(xyzw) or 1.0)
+    rotation = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.asarray(scale, np.float64)
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def _shown(file: GltfFile) -> Iterator[tuple[int, list[str]]]:
+    """Nodes of the scene that are visible, with the names on the way to them."""
+    nodes = file.list("nodes")
+    if scenes := file.list("scenes"):
+        roots = scenes[file.header.get("scene", 0)].get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [i for i in range(len(nodes)) if i not in children]
+    waiting = [(root, []) for root in reversed(roots)]
+    while waiting:
+        index, above = waiting.pop()
+        node = nodes[index]
+        if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
+            continue
+        names = [*above, str(node.get("name", ""))]
+        yield index, names
+        waiting += [(child, names) for child in reversed(node.get("children", []))]
+
+
+def _instances(file: GltfFile, node: dict[str, Any]) -> Iterator[Matrix]:
+    """Where the copies of a node's mesh stand in its frame."""
+    about = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
+    if about is None:
+        yield np.eye(4)
+        return
+    given = {name: file.accessor(i) for name, i in about["attributes"].items()}
+    count = max(map(len, given.values()), default=0)
+    usual = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}
+    rows = [given.get(name, np.tile(value, (count, 1))) for name, value in usual.items()]
+    for row in zip(*rows, strict=True):
+        yield _transform(*row)
+
+
+# ------------------------------------------------------------------ meshes
+
+
+def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> Iterator[Part]:
+    """The parts of a node's mesh, in its own frame; in that of the scene where it has a skin."""
+    mesh = file.list("meshes")[node["mesh"]]
+    weights = node.get("weights", mesh.get("weights", []))
+    for primitive in mesh["primitives"]:
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode in _NO_SURFACE:
+            continue
+        attributes, corners = _arrays(file, primitive)
+        vertices = attributes["POSITION"].astype(np.float64)
+        for weight, target in zip(weights, primitive.get("targets", []), strict=False):
+            if weight and "POSITION" in target:
+                vertices = vertices + weight * file.accessor(target["POSITION"])
+        if "skin" in node:
+            vertices = _bent(file, node["skin"], placed, attributes, vertices)
+        part = Part(str(mesh.get("name", "")), vertices, _triangles(corners, mode))
+        yield checked(part)
+
+
+def _arrays(
+    file: GltfFile, primitive: dict[str, Any]
+) -> tuple[dict[str, np.ndarray], Int[np.ndarray, " n"]]:
+    """Attributes of the vertices of a primitive, and which of them follow one another."""
+    given = primitive["attributes"]
+    wanted = [n for n in given if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_"))]
+    attributes, corners = draco_mesh(file, primitive) or ({}, None)
+    attributes |= {n: file.accessor(given[n]) for n in wanted if n not in attributes}
+    if "POSITION" not in attributes:
+        raise Unreadable("A mesh of the file has no positions.")
+    if corners is None and "indices" in primitive:
+        corners = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
+    if corners is None:
+        corners = np.arange(len(attributes["POSITION"]))
+    return attributes, corners
+
+
+def _triangles(corners: Int[np.ndarray, " n"], mode: int) -> Int[np.ndarray, "f 3"]:
+    if mode == _STRIP:
+        return strip_triangles(corners)
+    if mode == _FAN:
+        rim = corners[1:]
+        return np.stack([rim[:-1], rim[1:], np.broadcast_to(corners[:1], len(rim[1:]))], axis=1)
+    if mode != _TRIANGLES:
+        raise NotSupported(f"The file holds primitives of mode {mode}, which glTF does not know.")
+    if len(corners) % 3:
+        raise Unreadable(f"A mesh has {len(corners)} corners, which make no triangles.")
+    return corners.reshape(-1, 3)
+
+
+def _bent(
+    file: GltfFile,
+    skin: int,
+    placed: list[Matrix],
+    attributes: dict[str, np.ndarray],
+    vertices: Float[np.ndarray, "v 3"],
+) -> Float[np.ndarray, "v 3"]:
+    """Vertices moved with the joints that they hang on, in the frame of the scene."""
+    about = file.list("skins")[skin]
+    joints = np.stack([placed[i] for i in about["joints"]])
+    if "inverseBindMatrices" in about:
+        inverse = file.accessor(about["inverseBindMatrices"]).reshape(-1, 4, 4)
+        joints = joints @ np.swapaxes(inverse, 1, 2)[: len(joints)]
+    sets = sorted(name.removeprefix("JOINTS_") for name in attributes if "JOINTS_" in name)
+    if not sets:
+        raise Unreadable("A mesh has a skin, but its vertices hang on no joint.")
+    joint = np.concatenate([attributes[f"JOINTS_{s}"] for s in sets], axis=1).astype(np.int64)
+    weight = np.concatenate([attributes[f"WEIGHTS_{s}"] for s in sets], axis=1).astype(float)
+    if joint.size and joint.max() >= len(joints):
+        raise Unreadable("A vertex hangs on a joint that the skin does not have.")
+    total = weight.sum(axis=1)
+    weight = weight / np.where(total > 0, total, 1)[:, None]
+    homogeneous = np.append(vertices, np.ones((len(vertices), 1)), axis=1)
+    moved = np.zeros((len(vertices), 3))
+    for j, w in zip(joint.T, weight.T, strict=True):
+        moved += w[:, None] * np.einsum("vij,vj->vi", joints[j][:, :3], homogeneous)
+    return moved
+
+
+def _moved(part: Part, names: list[str], matrix: Matrix) -> Part:
+    """The part in the frame of the scene, its triangles showing the same side."""
+    vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    faces = part.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else part.faces
+    return Part("/".join(filter(None, [*names, part.name])), vertices, faces)

@@ -1,0 +1,219 @@
+"""The numbers of a glTF file: its chunks, buffers, accessors and Draco meshes."""
+
+import base64
+import json
+import urllib.parse
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxshape.data.formats.parts import NotSupported, Unreadable
+from jaxshape.limits import MESH_BYTES
+
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+
+
+class GltfFile(NamedTuple):
+    """A glTF file whose buffers have been read.
+
+    Attributes:
+        header: Its JSON.
+        buffers: Content of each of its buffers; None where only an extension could fill it.
+    """
+
+    header: dict[str, Any]
+    buffers: list[bytes | None]
+
+    def list(self, name: str) -> list[Any]:
+        """An array of the header, such as its `nodes`; empty where it has none."""
+        return self.header.get(name, [])
+
+    def accessor(self, index: int) -> np.ndarray:
+        """Numbers `[count width]` of an accessor, as floats where they are normalized integers."""
+        about = self.list("accessors")[index]
+        kind, width, count = _TYPES[about["componentType"]], _WIDTHS[about["type"]], about["count"]
+        if not 0 <= count * width * np.dtype(kind).itemsize <= MESH_BYTES:
+            raise Unreadable(f"An accessor says that it has {count} entries.")
+        if "bufferView" in about:
+            values = self.view(about["bufferView"], kind, width, count, about.get("byteOffset", 0))
+        elif "sparse" in about:
+            values = np.zeros((count, width), kind)
+        else:
+            raise Unreadable(f"Accessor {index} refers to no data.")
+        if "sparse" in about:
+            values = self._replaced(values, about["sparse"], kind)
+        if about.get("normalized"):
+            values = np.maximum(values / np.float64(np.iinfo(kind).max), -1.0)
+        return values
+
+    def _replaced(self, values: np.ndarray, sparse: dict[str, Any], kind: str) -> np.ndarray:
+        """The values with those replaced that the accessor gives one by one."""
+        places, new, count = sparse["indices"], sparse["values"], sparse["count"]
+        row = self.view(
+            places["bufferView"], _TYPES[places["componentType"]], 1, count,
+            places.get("byteOffset", 0),
+        )[:, 0]  # fmt: skip
+        if len(row) and row.max() >= len(values):
+            raise Unreadable("A sparse accessor replaces an entry that it does not have.")
+        values = values.copy()
+        values[row] = self.view(
+            new["bufferView"], kind, values.shape[1], count, new.get("byteOffset", 0)
+        )
+        return values
+
+    def view(self, index: int, kind: str, width: int, count: int, start: int) -> np.ndarray:
+        """Numbers `[count width]` of a buffer view, from some byte on."""
+        about, size = self.list("bufferViews")[index], np.dtype(kind).itemsize
+        content, row = self.view_bytes(index), about.get("byteStride", width * size)
+        if start < 0 or row < 1 or start + (count - 1) * row + width * size > len(content):
+            raise Unreadable(f"Buffer view {index} ends before the numbers that it should hold.")
+        return (
+            np.ndarray((count, width), kind, content, start, (row, size))
+            if count
+            else np.zeros((0, width), kind)
+        )
+
+    def view_bytes(self, index: int) -> bytes:
+        """All bytes of a buffer view."""
+        about = self.list("bufferViews")[index]
+        content = self.buffers[about["buffer"]]
+        if "EXT_meshopt_compression" in about.get("extensions", {}) or content is None:
+            raise NotSupported(
+                "The file is compressed by EXT_meshopt_compression; export it without."
+            )
+        start, length = about.get("byteOffset", 0), about["byteLength"]
+        if start < 0 or length < 0 or start + length > len(content):
+            raise Unreadable(f"Buffer view {index} reaches beyond its buffer.")
+        return content[start : start + length]
+
+
+def open_gltf(content: bytes, beside: Callable[[str], bytes]) -> GltfFile:
+    """Parse a `.glb` or `.gltf` file, and read what it refers to.
+
+    Args:
+        content: All of the file.
+        beside: Reads a file by its path relative to this one.
+
+    Raises:
+        Unreadable: The file is damaged.
+        NotSupported: It is of glTF 1.
+    """
+    binary = None
+    if content[:4] == b"glTF":
+        content, binary = _chunks(content)
+    header = json.loads(content.decode("utf-8-sig"))
+    if not isinstance(header, dict):
+        raise Unreadable("The file is no glTF: its JSON is no object.")
+    version = str(header.get("asset", {}).get("version", "2.0"))
+    if not version.startswith("2."):
+        raise NotSupported(f"The file is of glTF {version}; export glTF 2.0.")
+    buffers = [
+        _buffer(about, binary if i == 0 else None, beside)
+        for i, about in enumerate(header.get("buffers", []))
+    ]
+    return GltfFile(header, buffers)
+
+
+def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """The JSON and the binary chunk of a `.glb` file."""
+    version, length = (int.from_bytes(content[i : i + 4], "little") for i in (4, 8))
+    if version == 1:
+        raise NotSupported("The file is of glTF 1; export glTF 2.0.")
+    if version != 2:
+        raise Unreadable(f"The file is of glTF {version}, which there is not.")
+    if length > len(content):
+        raise Unreadable(f"The file says {length} bytes, but has {len(content)}.")
+    chunks, start = {}, 12
+    while start + 8 <= length:
+        size, kind = (int.from_bytes(content[i : i + 4], "little") for i in (start, start + 4))
+        if start + 8 + size > length:
+            raise Unreadable("A chunk of the file is not whole.")
+        chunks.setdefault(kind, content[start + 8 : start + 8 + size])
+        start += 8 + size
+    if _JSON not in chunks:
+        raise Unreadable("The file has no JSON chunk.")
+    return chunks[_JSON], chunks.get(_BINARY)
+
+
+def _buffer(
+    about: dict[str, Any], binary: bytes | None, beside: Callable[[str], bytes]
+) -> bytes | None:
+    uri, length = about.get("uri"), about["byteLength"]
+    if uri is None and binary is None:
+        return None  # a placeholder for what an extension unpacks
+    if uri is None:
+        content = binary
+    elif uri.startswith("data:"):
+        head, _, text = uri.partition(",")
+        raw = urllib.parse.unquote_to_bytes(text)
+        content = base64.b64decode(raw) if head.endswith(";base64") else raw
+    else:
+        content = _file(uri, beside)
+    assert content is not None
+    if len(content) < length:
+        raise Unreadable(f"A buffer has {len(content)} bytes, but the file says {length}.")
+    return content
+
+
+def referred(content: bytes) -> list[str]:
+    """Names of the files that a `.gltf` file refers to for its shapes; none for any other file.
+
+    Args:
+        content: All of the file.
+    """
+    if content[:1] != b"{" and content[:4] != b"\xef\xbb\xbf{":
+        return []
+    try:
+        uris = [about.get("uri", "data:") for about in json.loads(content).get("buffers", [])]
+    except (ValueError, RecursionError, AttributeError):  # reported by whoever loads it
+        return []
+    return [urllib.parse.unquote(uri) for uri in uris if not uri.startswith("data:")]
+
+
+def _file(uri: str, beside: Callable[[str], bytes]) -> bytes:
+    """A file beside the mesh: `with%20space.bin` is `with space.bin`."""
+    name = urllib.parse.unquote(uri)
+    try:
+        return beside(name)
+    except (FileNotFoundError, KeyError):
+        if name == uri:
+            raise
+        return beside(uri)  # some writers do not encode names
+
+
+def draco_mesh(
+    file: GltfFile, primitive: dict[str, Any]
+) -> tuple[dict[str, np.ndarray], np.ndarray] | None:
+    """Attributes and corners of a primitive that Draco compressed; None where it is not.
+
+    Args:
+        file: The file.
+        primitive: The primitive, as its JSON says.
+
+    Raises:
+        NotSupported: The library that decodes it is missing.
+    """
+    about = primitive.get("extensions", {}).get("KHR_draco_mesh_compression")
+    if about is None:
+        return None
+    try:
+        import DracoPy  # pyright: ignore[reportMissingImports]
+    except ImportError as problem:
+        raise NotSupported(
+            "The file is compressed by Draco; pip install 'jaxshape[draco]' to read it."
+        ) from problem
+    decoded: Any = DracoPy.decode(file.view_bytes(about["bufferView"]))
+    given = {one["unique_id"]: np.asarray(one["data"]) for one in decoded.attributes}
+    attributes = {}
+    for name, number in about["attributes"].items():
+        values = given[number].reshape(len(given[number]), -1)
+        accessor = file.list("accessors")[primitive["attributes"][name]]
+        if accessor.get("normalized"):
+            limit = np.float64(np.iinfo(_TYPES[accessor["componentType"]]).max)
+            values = np.maximum(values / limit, -1.0)
+        attributes[name] = values
+    return attributes, np.asarray(decoded.faces, np.int64).ravel()

@@ -1,0 +1,78 @@
+"""Wavefront OBJ: polygons of all objects and groups; lines, points and pictures are left out."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxshape.data.formats.parts import NotSupported, Part, Unreadable, positions, text_of
+from jaxshape.data.formats.polygons import triangulate
+
+NOT_POLYGONS = {
+    "curv": "curves", "curv2": "curves", "surf": "free-form surfaces", "call": "other files",
+    "bzp": "Bezier patches", "bsp": "B-spline patches", "cdp": "Cardinal patches", "res": "patches",
+}  # fmt: skip
+"""Statements that stand for surfaces which are not read."""
+
+
+class _Face(NamedTuple):
+    """A face as it stands in the file.
+
+    Attributes:
+        corners: Words of its corners, such as `3/1/2`.
+        before: How many vertices stand before it.
+    """
+
+    corners: list[str]
+    before: int
+
+
+def read_obj(content: bytes) -> list[Part]:
+    """The polygons of an OBJ file as triangles, one part for each object and group.
+
+    Args:
+        content: All of the file.
+
+    Raises:
+        Unreadable: The file is damaged.
+        NotSupported: It holds surfaces that are not polygons.
+        TooManyFaces: There are too many triangles.
+    """
+    vertices, groups, names = [], {"": []}, {"o": "", "g": ""}
+    current = groups[""]
+    for words in _statements(text_of(content)):
+        key = words[0]
+        if key == "v":
+            vertices.append(words[1:])
+        elif key in ("f", "fo"):
+            current.append(_Face(words[1:], len(vertices)))
+        elif key in names:
+            names[key] = " ".join(words[1:])
+            current = groups.setdefault("/".join(filter(None, names.values())), [])
+        elif key in NOT_POLYGONS:
+            raise NotSupported(f"The file holds {NOT_POLYGONS[key]} ({key}); export polygons.")
+    points = positions(vertices)
+    return [_part(name, points, faces) for name, faces in groups.items() if faces]
+
+
+def _statements(text: str) -> Iterator[list[str]]:
+    """Words of each line; a backslash continues a line, and `#` begins a comment."""
+    for line in text.replace("\\\n", " ").split("\n"):
+        words = (line.partition("#")[0] if "#" in line else line).split()
+        if words:
+            yield words
+
+
+def _part(name: str, points: np.ndarray, faces: list[_Face]) -> Part:
+    counts = np.array([len(face.corners) for face in faces])
+    try:
+        given = [int(corner.partition("/")[0]) for face in faces for corner in face.corners]
+        indices = np.array(given, np.int64)
+    except (ValueError, OverflowError) as problem:
+        raise Unreadable(f"A face is not a list of numbers: {problem}.") from problem
+    if (indices == 0).any():
+        raise Unreadable("A face refers to vertex 0, but an OBJ file counts from 1.")
+    before = np.repeat([face.before for face in faces], counts)
+    # Numbers below 0 count back from the vertices that stand before the face.
+    indices = np.where(indices < 0, indices + before, indices - 1)
+    return Part(name, points, triangulate(points, indices, counts))

@@ -1,0 +1,91 @@
+"""What all readers of mesh files give, and how they refuse."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxshape.limits import MESH_FACES
+
+MAX_FACES = MESH_FACES
+"""Most triangles of one mesh, counted over all its instances in a scene."""
+
+
+class Part(NamedTuple):
+    """Some of the triangles of a file, under the names that it gives them.
+
+    Attributes:
+        name: Names of the nodes, the object or the group, joined by `/`; empty where there is none.
+        vertices: Corners, in the frame and the unit of the file.
+        faces: Rows of `vertices`, three for each triangle.
+    """
+
+    name: str
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+
+
+class Unreadable(ValueError):
+    """A file breaks the rules of its format, or is not whole."""
+
+
+class NotSupported(ValueError):
+    """A file uses a feature of its format that is not read here."""
+
+
+class TooManyFaces(ValueError):
+    """A file holds more than `MAX_FACES` triangles."""
+
+
+def check_faces(count: int) -> None:
+    """Refuse a mesh that would take too much memory.
+
+    Args:
+        count: Number of its triangles.
+
+    Raises:
+        TooManyFaces: There are more than `MAX_FACES`.
+    """
+    if count > MAX_FACES:
+        raise TooManyFaces(f"The mesh has {count} faces, more than {MAX_FACES}.")
+
+
+def text_of(content: bytes) -> str:
+    """A text of any usual encoding, with lines that end in a newline alone.
+
+    Args:
+        content: UTF-8, or UTF-16 with a byte order mark; bytes that are neither become U+FFFD.
+    """
+    wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
+    text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def positions(rows: list[list[str]]) -> Float[np.ndarray, "v 3"]:
+    """Numbers of vertices, of which all words behind the third are left out.
+
+    Args:
+        rows: Words of each vertex.
+
+    Raises:
+        Unreadable: A vertex is not three numbers.
+    """
+    try:
+        return np.array([row[:3] for row in rows], np.float64).reshape(len(rows), 3)
+    except ValueError as problem:
+        raise Unreadable(f"A vertex is not three numbers: {problem}.") from problem
+
+
+def checked(part: Part) -> Part:
+    """The part, whose faces refer to vertices that are there.
+
+    Args:
+        part: Faces and vertices as they were read.
+
+    Raises:
+        Unreadable: A face refers to a vertex that the file does not hold.
+    """
+    faces = part.faces
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(part.vertices):
+        raise Unreadable("A face refers to a vertex that the file does not hold.")
+    return part

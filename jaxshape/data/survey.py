@@ -1,0 +1,152 @@
+"""What is to be known of many meshes before anything is made of them, in parallel. [host]
+
+Sizes tell the unit, shapes tell duplicates whatever their format, and seats tell the axis that
+points up. No geometry is kept.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+
+from jaxshape.data.archives import MeshSource
+from jaxshape.data.config import UNITS, UnitName
+from jaxshape.data.meshes import Skipped, load, lying_on_its_side
+from jaxshape.data.pool import Died, in_processes
+
+PLAUSIBLE = 0.05, 5.0
+"""Median diagonals, in metres, between which a collection is taken for things in a room."""
+
+IN_A_PROCESS = 8
+"""Meshes from which on it pays to start processes."""
+
+
+class Surveyed(NamedTuple):
+    """What is known of a mesh.
+
+    Attributes:
+        source: Where it is.
+        size: Diagonal of its box, in metres if the unit is right; 0 where it cannot be used.
+        signature: Numbers that tell its shape, see `signature_of`; empty where it cannot be used.
+        lies: Whether it is a seat that seems to lie on its side.
+        skipped: Why it cannot be used; None where it can.
+    """
+
+    source: MeshSource
+    size: float
+    signature: tuple[float, ...]
+    lies: bool
+    skipped: Skipped | None
+
+
+def survey(
+    sources: Sequence[MeshSource],
+    *,
+    up: str = "y",
+    front: str = "z",
+    unit: UnitName = "m",
+    workers: int | None = None,
+) -> Iterator[tuple[int, Surveyed]]:
+    """Look at each mesh once.
+
+    Args:
+        sources: The meshes.
+        up: Axis of the files that points up.
+        front: Axis of the files along which the object's front looks.
+        unit: Unit of the files.
+        workers: Processes, 1 or more; None for one for each CPU core.
+
+    Yields:
+        The number of a mesh in `sources`, and what is known of it, as they come.
+    """
+    workers = workers or os.cpu_count() or 1
+    if len(sources) < IN_A_PROCESS:
+        workers = 1
+    look_at = partial(look, up=up, front=front, unit=unit)
+    for number, found in in_processes(look_at, sources, workers):
+        source = sources[number]
+        if isinstance(found, Died):
+            found = Surveyed(source, 0.0, (), False, Skipped(source.name, "killed", str(found)))
+        yield number, found
+
+
+def look(source: MeshSource, *, up: str, front: str, unit: UnitName) -> Surveyed:
+    """Look at one mesh.
+
+    Args:
+        source: The mesh.
+        up: Axis of the file that points up.
+        front: Axis of the file along which the object's front looks.
+        unit: Unit of the file.
+    """
+    model = load(source, up=up, front=front, unit=unit)
+    if isinstance(model, Skipped):
+        return Surveyed(source, 0.0, (), False, model)
+    mesh = model.mesh
+    lies = lying_on_its_side(mesh)
+    return Surveyed(source, float(mesh.scale), signature_of(mesh), lies, None)
+
+
+def signature_of(mesh: trimesh.Trimesh) -> tuple[float, ...]:
+    """Thirteen numbers of a shape that stay when it is scaled, moved, turned to other axes, cut
+    into other triangles, or written in another format.
+
+    They are integrals over the surface, as shares of the diagonal: area, extents, centre and second
+    moments, in an order that does not depend on the axes.
+
+    Args:
+        mesh: The mesh.
+    """
+    corners = np.asarray(mesh.triangles, np.float64)
+    corners = (corners - mesh.bounds.mean(axis=0)) / mesh.scale
+    area = trimesh.triangles.area(corners)
+    total, around = area.sum(), corners.sum(axis=1)
+    center = np.einsum("f,fd->d", area, around) / 3 / total
+    second = np.einsum("f,fcd,fce->de", area, corners, corners)
+    second = (second + np.einsum("f,fd,fe->de", area, around, around)) / 12 / total
+    second -= np.outer(center, center)
+    values = [
+        mesh.extents / mesh.scale,
+        np.abs(center),
+        np.sqrt(np.maximum(np.diag(second), 0)),
+        np.abs(second[np.triu_indices(3, 1)]),
+    ]
+    return (float(np.sqrt(total)), *(float(x) for group in values for x in np.sort(group)))
+
+
+def doubted_size(sizes: Sequence[float], unit: UnitName) -> str | None:
+    """A sentence on the unit of a collection that has the size of nothing in a room.
+
+    Args:
+        sizes: Diagonals of its meshes, in metres if the unit is right.
+        unit: The unit that they were read with.
+
+    Returns:
+        What is wrong and what to do; None where nothing is.
+    """
+    median = float(np.median(sizes)) if len(sizes) else 1.0
+    low, high = PLAUSIBLE
+    if low <= median <= high:
+        return None
+    sizes_in = {name: median / UNITS[unit] * scale for name, scale in UNITS.items()}
+    fitting = [f"--unit {n} ({size:.2g} m)" for n, size in sizes_in.items() if low <= size <= high]
+    remedy = f"give {' or '.join(fitting)}" if fitting else "scale the files"
+    return (
+        f"The {len(sizes)} meshes have a median size of {median:.3g} m if their unit is {unit}, "
+        f"which nothing in a room has; {remedy}. The noise of a depth camera depends on sizes: "
+        "meshes below 5 cm or above 10 m are filmed as if they measured 1 m."
+    )
+
+
+def evenly(sources: Sequence[MeshSource], count: int) -> list[MeshSource]:
+    """Some of the meshes, from all over the collection.
+
+    Args:
+        sources: All meshes.
+        count: How many of them at most, 1 or more.
+    """
+    chosen = np.unique(np.linspace(0, len(sources) - 1, min(count, len(sources))).astype(int))
+    return [sources[i] for i in chosen]
