@@ -235,7 +235,7 @@ def table(means: Mapping[str, Any]) -> str:
 
 def plot(means: Mapping[str, Any], path: Path) -> None:
     """IoU in occluded voxels by number of frames; dashed after the search."""
-    figure = Figure(figsize=(9, 3.6))
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
     panels = figure.subplots(1, len(means), sharey=True, squeeze=False)[0]
     for axes, (camera, by_frames) in zip(panels, means.items(), strict=True):
         for i, (name, stages) in enumerate(by_frames["1"].items()):
@@ -251,7 +251,7 @@ def plot(means: Mapping[str, Any], path: Path) -> None:
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center",
                   frameon=False, fontsize=7)  # fmt: skip
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format="png", bbox_inches="tight")
+        figure.savefig(temporary, dpi=150, format="png")
 
 
 def main() -> None:
