@@ -23,7 +23,7 @@ WRONG = {
     DatasetConfig: {"paths": (*COUNT, 10**9), "frames": ((), (2, 1), (0,), (1, 10**9)),
                     "cameras": ((), ("polaroid",)),
                     "noisy": SHARE, "arcs": SHARE, "up": ("w", "+x"), "front": ("",),
-                    "resolution": (0, 33, 24), "seed": (-1, 2**32)},
+                    "resolution": (0, 33, 24), "seed": (-1, 2**32), "unit": ("ell",)},
     Architecture: {"encoder": ((), (4, 0, 8), (10**9,)), "decoder": ((0,),),
                    "code": (*COUNT, 1, 10**9), "occlusion": SWITCH},
     Completion: {"channels": ((4, 0, 8), (10**9, 1, 1)), "depth": (*COUNT, 10**9),

@@ -52,12 +52,12 @@ def vary_like(tree: PyTree, example: Array) -> PyTree:
 
     def vary(x):
         missing = tuple(axes - _axes_of(x))
-        return lax.pcast(x, missing, to="varying") if missing else x
+        return lax.pcast(jnp.asarray(x), missing, to="varying") if missing else x
 
     return jax.tree.map(vary, tree)
 
 
-def _axes_of(x: Array) -> frozenset[str]:
+def _axes_of(x: Any) -> frozenset[str]:
     """Axes along which an array may differ; JAX has had two names for them."""
     kind: Any = jax.typeof(x)
     return kind.vma if hasattr(kind, "vma") else kind.manual_axis_type.varying

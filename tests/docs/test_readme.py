@@ -52,7 +52,6 @@ NOT_RUN = {
     "make lint": "runs other programs",
     "make fuzz": "takes twenty minutes",
     "make kills": "takes an hour",
-    "cd docs/examples && jaxshape bench": "tests/docs/test_examples.py runs it",
     "make test-slow": "runs this",
     "git clone <this repository> && cd jaxshape": "fetches",
     "pip install jaxshape": "installs",

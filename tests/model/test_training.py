@@ -109,7 +109,7 @@ class FixedNetwork:
     def apply(self, variables, measured, *, noise, **_):
         params = variables["params"]
         code = jnp.broadcast_to(params["code"], (len(measured), *params["code"].shape))
-        logits = jnp.broadcast_to(params["logit"], measured.shape) + 0 * jnp.sum(noise)
+        logits = jnp.broadcast_to(params["logit"], measured.shape[:-1]) + 0 * jnp.sum(noise)
         return (logits, code), {}
 
 
