@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SHAPE, D
 
 from jaxshape.checks import positive
 from jaxshape.search.config import RefineConfig
@@ -15,7 +14,7 @@ from jaxshape.search.space import LatentSpace
 
 pytestmark = pytest.mark.usefixtures("unchecked_types")
 
-OBJECTS = 16
+OBJECTS, D, SHAPE = 16, 4, (3, 3, 3)  # the two latter as in conftest.py
 rng = np.random.default_rng(0)
 CODES = jnp.asarray(rng.normal(size=(OBJECTS, D)), jnp.float32)
 TARGETS = Target(*jnp.asarray(rng.random((2, OBJECTS, *SHAPE)), jnp.float32))

@@ -1,4 +1,4 @@
-"""Searches by name, and a new one from the recipe in CONTRIBUTING.md."""
+"""Searches by name, and a new one from the recipe in docs/extending.md."""
 
 import re
 import sys
@@ -141,14 +141,14 @@ def test_what_cannot_be_imported_is_one_sentence(package, name, message):
         build_refiner(name, 3, CONFIG)
 
 
-# --- CONTRIBUTING.md ----------------------------------------------------------------------------
+# --- docs/extending.md --------------------------------------------------------------------------
 
 
 @pytest.fixture
 def recipe(package):
     """The example, put where it says it belongs."""
-    text = (Path(__file__).parents[3] / "CONTRIBUTING.md").read_text()
-    section = text.split("## How to add a refiner")[1].split("\n## ")[0]
+    text = (Path(__file__).parents[3] / "docs" / "extending.md").read_text()
+    section = text.split("## A search")[1].split("\n## ")[0]
     (path,) = re.findall(r"`(\w+/\w+\.py)`", section)
     (name,) = re.findall(r"--method\s+([\w.:]+)", section)
     (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
@@ -158,7 +158,7 @@ def recipe(package):
     return name
 
 
-def test_the_recipe_of_contributing_is_one_file_and_works(recipe):
+def test_the_recipe_of_the_page_is_one_file_and_works(recipe):
     states, traces = search(recipe, RefineConfig(population=6, sigma0=0.5))
     assert np.all(states.best.loss < 0.2 * jax.vmap(sphere)(POINTS))
     assert np.all(np.diff(traces.best_loss, axis=1) <= 0)
