@@ -130,7 +130,8 @@ def test_what_goes_wrong_is_one_sentence(run, monkeypatch, tmp_path, problem, sa
 # Signals and surroundings ----------------------------------------------------------------------
 
 PROGRAM = """
-import time
+import signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # the suite may run in the background
 from jaxshape import cli
 from jaxshape.cli.recording import Reconstruct
 from jaxshape.files import write_text
