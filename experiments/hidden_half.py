@@ -34,21 +34,21 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from jaxshape.data.dataset import load_object, open_dataset
-from jaxshape.data.meshes import Skipped
+from jaxshape.data.dataset import open_dataset
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.config import PRESETS, Architecture, Completion, TrainConfig
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.training import finished_prior, train
-from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
+from jaxshape.report.figures import tidy
+from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill
 from jaxshape.results.metrics import occluded_scores
 from jaxshape.search.composition import complete
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 from jaxshape.search.residuals import SOFT, Residual
-from study import listed
+from study import Subject, listed, observed, tiny
 
 RESULTS = Path(__file__).parent / "results"
 CASES_AT_A_TIME = 64
@@ -135,13 +135,6 @@ def record_of(folder: Path, settings: TrainConfig, prior: ShapePrior) -> dict[st
     }
 
 
-def tiny(architecture: Architecture | Completion) -> Architecture | Completion:
-    """A network of the same kind that is trained in seconds."""
-    if isinstance(architecture, Completion):
-        return Completion((4, 4, 8), 1, 10)
-    return replace(architecture, encoder=(4, 4, 8, 8), decoder=(8, 8, 4), code=10)
-
-
 # ------------------------------------------------------------------ judging
 
 
@@ -185,11 +178,9 @@ def cases(config: Config, camera: str) -> Iterator[tuple[str, Case]]:
     """Each chair after each number of frames; those of which nothing was measured are left out."""
     name, noise = CAMERAS[camera]
     seen = EvaluateConfig(frames=FRAMES, camera=name, noise=noise)
-    for chair in listed(config.meshes, config.chairs)[: config.chairs]:
-        model = load_object(chair)
-        case = None if isinstance(model, Skipped) else observe(model, seen)
-        if case is not None:
-            yield model.name, case
+    chairs = listed(config.meshes, config.chairs)[: config.chairs]
+    subjects = [Subject(chair.name, "", chair) for chair in chairs]
+    return ((subject.name, case) for subject, case in observed(subjects, seen))
 
 
 def judged(priors: Mapping[str, ShapePrior], config: Config, camera: str) -> dict[str, Any]:
@@ -246,7 +237,7 @@ def plot(means: Mapping[str, Any], path: Path) -> None:
         axes.set(xscale="log", xlabel="frames", title=camera)
         axes.set_xticks(FRAMES, [str(k) for k in FRAMES])
         axes.minorticks_off()
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     panels[0].set_ylabel("IoU in occluded voxels")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center",
                   frameon=False, fontsize=7)  # fmt: skip

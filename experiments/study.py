@@ -22,6 +22,7 @@ from jaxshape.data.dataset import Object, hash_seed, load_object
 from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.data.meshes import Skipped
 from jaxshape.geometry.overlap import iou
+from jaxshape.model.config import Architecture, Completion
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.report.figures import tidy
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
@@ -159,7 +160,7 @@ def compare(
         task = bar.add_task(journal.path.stem, total=searches)
         for start in range(0, len(missing), group):
             began = time.perf_counter()
-            batch = list(_observed(missing[start : start + group], config))
+            batch = list(observed(missing[start : start + group], config))
             if not batch:
                 continue
             left = _left(contestants, [one for one, _ in batch], journal)
@@ -185,7 +186,7 @@ def _left(names: Iterable[str], chairs: Sequence[Subject], journal: Journal) -> 
     return [name for name in names if not all(name in one for one in met)]
 
 
-def _observed(chairs: Sequence[Subject], config: EvaluateConfig) -> Iterator[tuple[Subject, Case]]:
+def observed(chairs: Sequence[Subject], config: EvaluateConfig) -> Iterator[tuple[Subject, Case]]:
     """The chairs and what is seen of them; those that cannot be used are named and left out."""
     for chair in chairs:
         model = load_object(chair.item)
@@ -194,6 +195,14 @@ def _observed(chairs: Sequence[Subject], config: EvaluateConfig) -> Iterator[tup
             print(f"{chair.name} is left out: {model}")
         else:
             yield chair, case
+
+
+def tiny(architecture: Architecture | Completion) -> Architecture | Completion:
+    """A network of the same kind that is trained in seconds."""
+    if isinstance(architecture, Completion):
+        return Completion((4, 4, 8), 1, 10)
+    code = min(architecture.code, 10)
+    return replace(architecture, encoder=(4, 4, 8, 8), decoder=(8, 8, 4), code=code)
 
 
 def _timed(run: Callable[..., Scores], *args: Any) -> dict[str, np.ndarray]:

@@ -46,7 +46,7 @@ from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.training import finished_prior, train
 from jaxshape.report.palette import COLORS
 from jaxshape.results.evaluation import evaluate, summarize
-from study import SEARCH, SEEN
+from study import SEARCH, SEEN, tiny
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -201,13 +201,6 @@ def run(config: Config) -> dict[str, Any]:
         write_json(path, found)
         print(line(name, found[name]), flush=True)
     return found
-
-
-def tiny(architecture: Architecture | Completion) -> Architecture | Completion:
-    """A network of the same kind that is trained in seconds."""
-    if isinstance(architecture, Completion):
-        return Completion((4, 4, 8), 1, 10)
-    return Architecture((4, 4, 8, 8), (8, 8, 4), min(architecture.code, 10))
 
 
 def line(name: str, scores: dict[str, Any]) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 from rich.console import Console
@@ -79,10 +80,8 @@ def advice(device: str) -> Iterator[str]:
             yield "The processor has no matrix units for bfloat16: leave --bfloat16 out."
         if (os.cpu_count() or 1) < 4:
             yield "Training has few cores to spread over; a GPU is used where JAX finds one."
-        for tool in ("nvidia-smi", "rocm-smi"):
-            if any((Path(p) / tool).exists() for p in os.environ.get("PATH", "").split(os.pathsep)):
-                yield "There is a GPU, and JAX does not see it: pip install 'jaxshape[cuda]'."
-                break
+        if which("nvidia-smi") or which("rocm-smi"):
+            yield "There is a GPU, and JAX does not see it: pip install 'jaxshape[cuda]'."
     if find_spec("embreex") is None:
         yield "Without embreex, virtual cameras trace rays by trimesh alone, which is far slower."
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from problems import SHAPE, D
 
 from jaxshape.model.shapes import Prepared, ShapeModel, ShapePrior
 from jaxshape.search import rows
-
-SHAPE, D = (3, 3, 3), 4
 
 
 class Counter:

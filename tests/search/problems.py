@@ -9,6 +9,9 @@ import pytest
 from jaxshape.search.refiner import advance
 from jaxshape.search.stopping import Tolerances
 
+SHAPE, D = (3, 3, 3), 4
+"""Grids and codes of the small decoder of conftest.py."""
+
 NEVER = Tolerances(
     tolfun=0.0,
     tolfunhist=0.0,

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from problems import SHAPE, D
 
 from jaxshape.checks import positive
 from jaxshape.search.config import RefineConfig
@@ -14,7 +15,7 @@ from jaxshape.search.space import LatentSpace
 
 pytestmark = pytest.mark.usefixtures("unchecked_types")
 
-OBJECTS, D, SHAPE = 16, 4, (3, 3, 3)  # the two latter as in conftest.py
+OBJECTS = 16
 rng = np.random.default_rng(0)
 CODES = jnp.asarray(rng.normal(size=(OBJECTS, D)), jnp.float32)
 TARGETS = Target(*jnp.asarray(rng.random((2, OBJECTS, *SHAPE)), jnp.float32))
