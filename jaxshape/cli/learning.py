@@ -229,10 +229,16 @@ class Train:
             from jaxshape.model.pca import fit
 
             return fit(surfaces(data), self.config.architecture.code, self.config.seed)
-        from jaxshape.model.training import finished_prior
+        from jaxshape.model.training import finished_prior, validation_batch
+        from jaxshape.search.calibrating import fit_calibration
 
-        is_first = _fit(output, data, self.config, start)
-        return finished_prior(output, data, self.config) if is_first else None
+        if not _fit(output, data, self.config, start):
+            return None
+        prior, kept = finished_prior(output, data, self.config), validation_batch(data, self.config)
+        if kept is None:
+            return prior
+        with console.status("calibrating probabilities"):
+            return prior._replace(calibration=fit_calibration(prior, kept.grids, kept.surface))
 
     def build(self, output: Path) -> tuple[Path, tuple[list[Any], list[Any]]]:
         """The folder of a dataset of --meshes; the models kept out of it, and those skipped."""

@@ -37,7 +37,7 @@ class Rebuild:
             "import path, package.module:function.",
         ),
     ] = None
-    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
+    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig(samples=16)
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
     seed: int = 0

@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxshape.geometry.grids import Grids
+from jaxshape.model.calibration import Calibration
 from jaxshape.model.chunks import in_chunks
 from jaxshape.model.config import Precision
 
@@ -85,12 +86,14 @@ class ShapePrior(NamedTuple):
         code_mean: Mean code of the training set `[d]`.
         code_covariance: Covariance of the codes of the training set `[d d]`, positive definite. It
             sets the scale of the steps of a search.
+        calibration: What its logits are worth as probabilities; None where nobody has measured it.
     """
 
     model: ShapeModel
     params: PyTree
     code_mean: Float[Array, " d"]
     code_covariance: Float[Array, "d d"]
+    calibration: Calibration | None = None
 
     @property
     def code_size(self) -> int:

@@ -18,6 +18,7 @@ from jaxshape import limits, reading
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.autoencoder import AUTOENCODER
+from jaxshape.model.calibration import Calibration
 from jaxshape.model.completion import COMPLETION
 from jaxshape.model.pca import PCA
 from jaxshape.model.shapes import ShapeModel, ShapePrior, resolution_of
@@ -79,6 +80,8 @@ def save_prior(
             tensors[name] = _half(weights)
     tensors["code_mean"] = np.asarray(prior.code_mean, np.float32)
     tensors["code_covariance"] = np.asarray(prior.code_covariance, np.float32)
+    if prior.calibration is not None:
+        tensors["calibration"] = np.asarray(prior.calibration, np.float32)
     form = FORMAT_IN_BYTES if in_bytes else FORMAT
     metadata = {"format": form, "kind": prior.model.kind, "card": json.dumps(card)}
     with atomic_path(path) as temporary:
@@ -116,6 +119,7 @@ def load_prior(
     tensors, metadata = _read(where)
     found = _model(metadata.get("kind", AUTOENCODER.kind), model, where)
     mean, covariance = tensors.pop("code_mean", None), tensors.pop("code_covariance", None)
+    calibration = _calibration(tensors.pop("calibration", None), where)
     # Converted by NumPy: JAX would compile a program for each shape.
     with np.errstate(over="ignore"):  # what is too large is found to be infinite below
         named = {name: jnp.asarray(x) for name, x in _weights(tensors, where).items()}
@@ -124,7 +128,18 @@ def load_prior(
     except (TypeError, ValueError) as problem:
         raise WeightsError(f"{str(where)!r} holds no weights: {problem}.") from None
     _check(found, params, mean, covariance, where)
-    return ShapePrior(found, params, jnp.asarray(mean), jnp.asarray(covariance))
+    return ShapePrior(found, params, jnp.asarray(mean), jnp.asarray(covariance), calibration)
+
+
+def _calibration(numbers: np.ndarray | None, path: Path) -> Calibration | None:
+    if numbers is None:
+        return None
+    if numbers.shape != (3,) or not np.isfinite(numbers).all() or (numbers[:2] < 0).any():
+        raise WeightsError(
+            f"{str(path)!r} is damaged: calibration is {numbers.tolist()}; expected a slope and a "
+            "doubt that are not negative, and an offset."
+        )
+    return Calibration(*map(float, numbers))
 
 
 def _weights(tensors: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:

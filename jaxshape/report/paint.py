@@ -29,9 +29,11 @@ def paints(found: ResultFolder) -> dict[str, Paint]:
         found: The result. Meshes of older results, and of points, have neither.
 
     Returns:
-        "color" where frames gave the mesh colours, and "source" where it is known which vertices
-        were measured.
+        "color" where frames gave the mesh colours, "source" where it is known which vertices were
+        measured, and "confidence" where it is known how sure they are.
     """
+    from matplotlib import colormaps  # it takes long to import
+
     there = {}
     if found.color is not None:
         there["color"] = Paint("colours of the frames", found.color)
@@ -39,4 +41,7 @@ def paints(found: ResultFolder) -> dict[str, Paint]:
         blue, orange = (np.uint8(255 * rgb(COLORS[name])) for name in ("measured", "predicted"))
         by_source = np.where(found.measured[:, None], blue, orange)
         there["source"] = Paint("measured (blue), predicted (orange)", by_source)
+    if found.confidence is not None:
+        shades = np.uint8(255 * colormaps["viridis"](found.confidence)[:, :3])
+        there["confidence"] = Paint("how sure: 0 (violet) to 1 (yellow)", shades)
     return there

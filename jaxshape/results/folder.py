@@ -45,6 +45,7 @@ class ResultFolder(NamedTuple):
         result: Content of result.json.
         mesh: Mesh in the world frame, in metres.
         measured: True for its vertices on the measured surface; None where that is not known.
+        confidence: Probability that there is surface at its vertices; None where that is not known.
         color: Colours of its vertices; None where it has none.
         grids: Grids of `GRIDS` that are there.
         origin: Object-frame position of voxel coordinate (0, 0, 0), in metres.
@@ -62,6 +63,7 @@ class ResultFolder(NamedTuple):
     result: dict[str, Any]
     mesh: trimesh.Trimesh | None
     measured: Bool[np.ndarray, " n"] | None
+    confidence: Float[np.ndarray, " n"] | None
     color: UInt8[np.ndarray, "n 3"] | None
     grids: dict[str, Bool[np.ndarray, "x y z"]]
     origin: Float[np.ndarray, " 3"]
@@ -105,12 +107,13 @@ def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
     grids, frame = read("grid.npz", _grids, ({}, None))
     origin, voxel_size, T_world_object = frame or _stand_in(keyframes)
     T_object_world = np.linalg.inv(T_world_object)
-    mesh, measured, color = read("mesh.ply", read_ply, (None, None, None))
+    mesh, measured, color, confidence = read("mesh.ply", read_ply, (None,) * 4)
     return ResultFolder(
         name=folder.resolve().name,
         result=read("result.json", reading.read_json_object, {}),
         mesh=mesh,
         measured=measured,
+        confidence=confidence,
         color=color,
         grids=grids,
         origin=origin,

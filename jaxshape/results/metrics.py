@@ -195,3 +195,41 @@ def boundary_points(occupied: Bool[Array | np.ndarray, "x y z"]) -> Float[np.nda
         faces = np.argwhere(np.diff(padded, axis=axis))  # between voxel i - 1 and i, unpadded
         points.append(faces + np.where(np.arange(3) == axis, 0.0, -0.5))
     return np.concatenate(points) / max(np.shape(occupied))
+
+
+class Reliability(NamedTuple):
+    """How often what was given a probability came true, by bins of equal width.
+
+    Attributes:
+        predicted: Mean probability of the voxels in each bin `[bin]`; 0 where there are none.
+        occurred: Share of them that are occupied `[bin]`; 0 where there are none.
+        share: Share of all voxels that are in the bin `[bin]`.
+    """
+
+    predicted: Float[np.ndarray, " bin"]
+    occurred: Float[np.ndarray, " bin"]
+    share: Float[np.ndarray, " bin"]
+
+    @property
+    def error(self) -> float:
+        """The expected calibration error: the mean of |predicted - occurred| over voxels."""
+        return float(np.abs(self.predicted - self.occurred) @ self.share)
+
+
+def reliability(
+    probability: Float[np.ndarray, " n"], occupied: Bool[np.ndarray, " n"], bins: int = 15
+) -> Reliability:
+    """Compare probabilities with what came true. [host]
+
+    Args:
+        probability: Probabilities of voxels `[n]`, from 0 to 1.
+        occupied: Whether each voxel is occupied `[n]`.
+        bins: Bins of equal width, 1 or more.
+    """
+    place = np.minimum((probability * bins).astype(int), bins - 1)
+    count, predicted, occurred = (
+        np.bincount(place, weights, bins).astype(np.float64)
+        for weights in (None, probability, occupied)
+    )
+    some = np.maximum(count, 1)
+    return Reliability(predicted / some, occurred / some, count / max(count.sum(), 1))

@@ -17,6 +17,7 @@ from jaxshape.geometry.overlap import iou
 from jaxshape.geometry.pixels import Sensor
 from jaxshape.mapping.map.doubts import ALL_SEEN, Unseen
 from jaxshape.results.coloring import ColorView, color_vertices
+from jaxshape.results.confidence import confidence_at
 from jaxshape.results.fused_surface import fuse_surface
 from jaxshape.results.surface import surface, write_mesh
 from jaxshape.results.traces import write_trace
@@ -111,11 +112,11 @@ def write_shape(
     alone.
     """
     one = only(reconstruction)
-    found = shape_mesh(observation, one.composed, one.fill_logits)
-    told = {"measured": found.measured, "color": found.color}
-    write_mesh(found.mesh, folder / "mesh.glb", **told)
+    found = shape_mesh(observation, one.composed, one.fill_logits, one.probability)
+    flags = {"measured": found.measured, "color": found.color, "confidence": found.confidence}
+    write_mesh(found.mesh, folder / "mesh.glb", **flags)
     world = found.mesh.copy().apply_transform(observation.T_world_object)
-    write_mesh(world, folder / "mesh.ply", **told)
+    write_mesh(world, folder / "mesh.ply", **flags)
     _write_grids(folder / "grid.npz", observation, one)
     if one.trace is None:
         (folder / "trace.npz").unlink(missing_ok=True)  # of an earlier search
@@ -136,18 +137,22 @@ class ShapeMesh(NamedTuple):
             mesh of a composed grid.
         color: Colours of the vertices; None where no frame has colours.
         dropped: Loose pieces that were left out.
+        confidence: Probability that there is surface at each vertex, from 0 to 1; None where
+            nothing says how sure the shape is.
     """
 
     mesh: trimesh.Trimesh
     measured: Bool[np.ndarray, " n"] | None
     color: UInt8[np.ndarray, "n 3"] | None
     dropped: int
+    confidence: Float[np.ndarray, " n"] | None = None
 
 
 def shape_mesh(
     observation: Observation,
     composed: Bool[np.ndarray, "x y z"],
     logits: Float[np.ndarray, "x y z"],
+    probability: Float[np.ndarray, "x y z"] | None = None,
 ) -> ShapeMesh:
     """The mesh of what was measured and, elsewhere, of the decoded shape.
 
@@ -155,27 +160,39 @@ def shape_mesh(
         observation: Measurement of the object.
         composed: The composed grid, which makes the mesh where there are no signed distances.
         logits: Logits of the shape that fills what was not measured.
+        probability: Probability that each voxel is surface; None leaves the mesh without
+            confidence.
 
     Raises:
         ValueError: The shape is empty.
     """
+    frame = observation.frame
+    sure = lambda mesh: (  # noqa: E731
+        None if probability is None else confidence_at(mesh.vertices, probability, frame)
+    )
     if observation.field is None:
-        mesh = surface(composed, observation.frame, smoothing=SMOOTHING)
-        return ShapeMesh(mesh, None, None, 0)
-    mesh, measured, dropped = fuse_surface(observation.field, logits, observation.frame)
-    reach = COLOR_REACH * float(np.max(observation.frame.voxel_size))
+        mesh = surface(composed, frame, smoothing=SMOOTHING)
+        return ShapeMesh(mesh, None, None, 0, sure(mesh))
+    mesh, measured, dropped = fuse_surface(observation.field, logits, frame)
+    reach = COLOR_REACH * float(np.max(frame.voxel_size))
     color = color_vertices(
         mesh, measured, observation.views, reach=reach, sensor=observation.sensor
     )
-    return ShapeMesh(mesh, measured, color, dropped)
+    return ShapeMesh(mesh, measured, color, dropped, sure(mesh))
 
 
 def _of_mesh(found: ShapeMesh) -> dict[str, Any]:
-    if found.measured is None:
-        return {}
     area = found.mesh.area_faces
-    share = found.measured[found.mesh.faces].mean(axis=1) @ area / area.sum()
-    return {"mesh_measured": round(float(share), 4), "mesh_pieces_dropped": found.dropped}
+    over_area = lambda x: round(float(x[found.mesh.faces].mean(axis=1) @ area / area.sum()), 4)  # noqa: E731
+    figures: dict[str, Any] = {}
+    if found.measured is not None:
+        figures |= {
+            "mesh_measured": over_area(found.measured),
+            "mesh_pieces_dropped": found.dropped,
+        }
+    if found.confidence is not None:
+        figures["mesh_confidence"] = over_area(found.confidence)
+    return figures
 
 
 def _judged(observation: Observation, found: ShapeMesh, is_mirrored: bool) -> dict[str, Any]:
@@ -258,6 +275,9 @@ def _write_grids(path: Path, observation: Observation, one: Any) -> None:
         "voxel_size": np.asarray(observation.frame.voxel_size),
         "T_world_object": observation.T_world_object,
     }
+    if one.samples is not None:
+        arrays["samples"] = one.samples > 0
+        arrays["probability"] = one.probability.astype(np.float16)
     if observation.truth is not None:
         arrays["truth"] = observation.truth
     with atomic_path(path) as temporary:

@@ -92,6 +92,7 @@ def write_mesh(
     *,
     measured: Bool[np.ndarray, " n"] | None = None,
     color: UInt8[np.ndarray, "n 3"] | None = None,
+    confidence: Float[np.ndarray, " n"] | None = None,
 ) -> None:
     """Write a mesh as PLY, GLB or OBJ; an earlier file is replaced only by a complete one. [host]
 
@@ -102,6 +103,8 @@ def write_mesh(
             or 0 for each vertex. None for no such flags; OBJ has none.
         color: Colours of the vertices, sRGB; None for none. GLB holds them as linear light, as its
             standard asks.
+        confidence: Probability that there is surface at each vertex, from 0 to 1: `confidence` in
+            PLY, `_CONFIDENCE` in GLB. None for none; OBJ has none.
 
     Raises:
         ValueError: The suffix is another one.
@@ -115,12 +118,14 @@ def write_mesh(
     copy = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     with atomic_path(path) as temporary:
         if suffix == ".glb":
-            _export_glb(copy, temporary, measured, color)
+            _export_glb(copy, temporary, measured, color, confidence)
             return
         if color is not None:
             copy.visual = ColorVisuals(copy, vertex_colors=color)
         if measured is not None and suffix == ".ply":
             copy.vertex_attributes["measured"] = measured.astype(np.uint8)
+        if confidence is not None and suffix == ".ply":
+            copy.vertex_attributes["confidence"] = confidence.astype(np.float32)
         copy.export(temporary)
 
 
@@ -129,10 +134,13 @@ def _export_glb(
     path: Path,
     measured: Bool[np.ndarray, " n"] | None,
     color: UInt8[np.ndarray, "n 3"] | None,
+    confidence: Float[np.ndarray, " n"] | None,
 ) -> None:
     """Write a GLB with normals, so that viewers shade it smoothly, and a dull material."""
     if measured is not None:
         mesh.vertex_attributes["_MEASURED"] = measured.astype(np.float32)
+    if confidence is not None:
+        mesh.vertex_attributes["_CONFIDENCE"] = confidence.astype(np.float32)
     if color is not None:
         linear = _linear_light(color)
         mesh.vertex_attributes["_COLOR_0"] = np.insert(linear, 3, 1, axis=1).astype(np.float32)
@@ -161,11 +169,14 @@ class MeshFile(NamedTuple):
         mesh: Its vertices and faces.
         measured: True for vertices on a measured surface; None where the file does not tell.
         color: Colours of the vertices, sRGB; None where there are none.
+        confidence: Probability that there is surface at each vertex; None where the file does not
+            tell.
     """
 
     mesh: trimesh.Trimesh
     measured: Bool[np.ndarray, " n"] | None
     color: UInt8[np.ndarray, "n 3"] | None
+    confidence: Float[np.ndarray, " n"] | None = None
 
 
 def read_ply(path: str | os.PathLike[str]) -> MeshFile:
@@ -186,7 +197,10 @@ def read_ply(path: str | os.PathLike[str]) -> MeshFile:
         raise ValueError("its faces have vertices that are not there")
     vertex = mesh.metadata["_ply_raw"]["vertex"]
     measured = vertex["data"]["measured"] > 0 if "measured" in vertex["properties"] else None
+    sure = None
+    if "confidence" in vertex["properties"]:
+        sure = np.clip(np.nan_to_num(vertex["data"]["confidence"].astype(np.float32)), 0, 1)
     visual: Any = mesh.visual
     color = visual.vertex_colors[:, :3] if visual.kind == "vertex" else None
     plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    return MeshFile(plain, measured, None if color is None else np.asarray(color))
+    return MeshFile(plain, measured, None if color is None else np.asarray(color), sure)

@@ -93,5 +93,15 @@ def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*ba
         The composed shape `[*batch x y z]`: True where (1 - M) F + M p is above 1/2. For binary
         grids that is F where something was measured, and the completed shape elsewhere.
     """
-    F, M, p = (jnp.asarray(x).astype(jnp.float32) for x in (occupied, occluded, completed))
-    return (1 - M) * F + M * p > 0.5
+    return known_or(Grids(occupied, occluded), completed) > 0.5
+
+
+def known_or(grids: Grids, completed: Grid) -> Float[Array, "*batch x y z"]:
+    """What was measured where something was, the completed shape elsewhere: (1 - M) F + M p.
+
+    Args:
+        grids: F and M `[*batch x y z]`, binary or soft.
+        completed: The decoded shape `[*batch x y z]`: True where occupied, or its probability p.
+    """
+    F, M, p = (jnp.asarray(x).astype(jnp.float32) for x in (*grids[:2], completed))
+    return (1 - M) * F + M * p

@@ -60,6 +60,8 @@ class RefineConfig:
             `bfloat16`.
         symmetry: Fill what is hidden on one side of an object with what its mirror image shows,
             where the measured halves agree (not in the paper). The search itself is the same.
+        samples: Shapes to draw from the posterior of each object once its search has ended, 0 or
+            more; they say how sure each voxel is. 1 would say nothing.
 
     Raises:
         ValueError: A setting is outside its range.
@@ -77,6 +79,7 @@ class RefineConfig:
     target: Number | None = None
     precision: Precision = "float32"
     symmetry: bool = True
+    samples: int = 0
 
     def __post_init__(self) -> None:
         if self.objective is not None:
@@ -86,6 +89,7 @@ class RefineConfig:
         one_of("symmetry", self.symmetry, (True, False))
         whole("iterations", self.iterations, 1, STEPS)
         whole("population", self.population, 3, POPULATION, "each is a shape to decode")
+        whole("samples", self.samples, 0, POPULATION, "each is a shape to decode")
         for name in ("sigma0", "step_size", "bound"):
             value = getattr(self, name)
             if value is not None or name == "sigma0":

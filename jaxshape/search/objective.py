@@ -141,6 +141,7 @@ def objective(
     penalty: Penalty | None = None,
     penalty_weight: Float[Array, ""] | float = 1.0,
     grids: Grids | None = None,
+    space: LatentSpace | None = None,
     precision: Precision = "float32",
 ) -> Callable[[Float[Array, " d"]], Float[Array, ""]]:
     """The objective of one object as a function of its code, for your own loop.
@@ -156,6 +157,7 @@ def objective(
         penalty_weight: Factor of the penalty, 0 or more.
         grids: F and M of the object `[x y z]`, for models whose decoder takes the measurement; None
             for models that decode from the code alone.
+        space: Coordinates of the points that the objective takes (`whitened`); None for codes.
         precision: Precision of the decoder's matrix products, `float32` or `bfloat16`.
 
     Returns:
@@ -169,12 +171,13 @@ def objective(
     prepared = prepare_one(prior, batch, precision)
     own = Own(pick(prepared.own, 0), target, jnp.asarray(penalty_weight, jnp.float32))
 
-    def about(code):
-        how = evaluation(prior.model, prepared, residual, penalty, code, own)
-        return composed(how, raw(prior)._replace(mean=jnp.zeros_like(code)), own)
+    def about(point):
+        chosen = raw(prior)._replace(mean=jnp.zeros_like(point)) if space is None else space
+        how = evaluation(prior.model, prepared, residual, penalty, chosen.to_code(point), own)
+        return composed(how, chosen, own)
 
     return Composed(
-        lambda code: about(code)(code), lambda code, count: about(code).expansion(code, count)
+        lambda point: about(point)(point), lambda point, count: about(point).expansion(point, count)
     )
 
 

@@ -11,12 +11,14 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxshape.checks import is_traced
 from jaxshape.geometry.grids import Grid, Grids
+from jaxshape.model.calibration import UNCALIBRATED
 from jaxshape.model.shapes import ShapePrior, decode, encode
-from jaxshape.search.composition import complete
+from jaxshape.search.composition import complete, known_or
 from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.devices import over_devices
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty
+from jaxshape.search.posterior import sample_codes
 from jaxshape.search.refiner import Refiner, Trace
 from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual
 from jaxshape.search.run import Callback, one_key_each, refine
@@ -44,6 +46,11 @@ class Reconstruction(NamedTuple):
         path: Best code so far after each iteration `[object iteration d]`; None without a search.
         iterations: Iterations that the search took `[object]`; None without a search.
         stop: Why the search ended `[object]`, as a `StopReason`; None without a search.
+        samples: Logits of shapes that explain what was measured as well as this one
+            `[object sample x y z]`, filled as `fill_logits`; None without `config.samples`.
+        probability: Probability that each voxel is surface `[object x y z]`, from 0 to 1: measured
+            where something was, calibrated on the samples elsewhere; None without
+            `config.samples`.
     """
 
     first_code: Float[Array, "object d"]
@@ -61,6 +68,8 @@ class Reconstruction(NamedTuple):
     path: Float[Array, "object iteration d"] | None
     iterations: Int[Array, " object"] | None
     stop: Int[Array, " object"] | None
+    samples: Float[Array, "object sample x y z"] | None = None
+    probability: Float[Array, "object x y z"] | None = None
 
 
 def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner | None:
@@ -198,8 +207,18 @@ def reconstruct(
                 precision=config.precision,
             )
             code, logits, objective = found.code, found.logits, score(found.logits, targets)
-        conditional = prior.model.conditional
-        filled = complete(grids, logits, symmetry=config.symmetry, conditional=conditional)
+        fill = partial(complete, symmetry=config.symmetry, conditional=prior.model.conditional)
+        filled = fill(grids, logits)
+        samples = probability = None
+        if config.samples:
+            draw = partial(sample_codes, residual=residual, target=targets)
+            codes = draw(keys, prior, grids, code, config.samples)
+            decoded = decode(prior, codes, grids)
+            each = [jnp.broadcast_to(x[:, None], decoded.shape) for x in grids[:2]]
+            samples = fill(Grids(*each), decoded).logits
+            calibration = prior.calibration or UNCALIBRATED
+            hidden = calibration.probability(filled.logits, jnp.std(samples, axis=1))
+            probability = known_or(grids, hidden)
         return Reconstruction(
             first_code=first_code,
             code=code,
@@ -216,6 +235,8 @@ def reconstruct(
             path=found and found.path,
             iterations=found and found.iterations,
             stop=found and found.stop,
+            samples=samples,
+            probability=probability,
         )
 
     rows = one_key_each(keys, len(grids.occupied)), grids, earlier

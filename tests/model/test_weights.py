@@ -10,6 +10,7 @@ from safetensors.numpy import load_file, save_file
 
 from jaxshape.model import weights
 from jaxshape.model.autoencoder import AUTOENCODER, initialize
+from jaxshape.model.calibration import Calibration
 from jaxshape.model.config import Architecture
 from jaxshape.model.shapes import ShapeModel, ShapePrior
 from jaxshape.model.weights import (
@@ -166,6 +167,17 @@ def test_weights_are_known_by_their_numbers(prior):
     assert fingerprint(copy) == fingerprint(prior)
     changed = prior._replace(code_mean=prior.code_mean.at[3].set(1e-6))
     assert fingerprint(changed) != fingerprint(prior)
+
+
+def test_the_calibration_is_kept_and_a_damaged_one_is_refused(prior, tmp_path):
+    path = tmp_path / "sure.safetensors"
+    save_prior(path, prior._replace(calibration=Calibration(0.75, 0.125, -0.5)), {})
+    assert load_prior(path).calibration == Calibration(0.75, 0.125, -0.5)
+    save_prior(path, prior, {})
+    assert load_prior(path).calibration is None
+    save_prior(path, prior._replace(calibration=Calibration(-1.0, 0.0, 0.0)), {})
+    with pytest.raises(WeightsError, match="calibration is .*not negative"):
+        load_prior(path)
 
 
 # --- kinds of models ----------------------------------------------------------------------------

@@ -157,8 +157,10 @@ def painted():
 
 def test_ply_tells_what_was_measured_and_its_colours(tmp_path, painted):
     mesh, measured, color = painted
-    write_mesh(mesh, tmp_path / "ball.ply", measured=measured, color=color)
+    sure = np.linspace(0, 1, len(measured), dtype=np.float32)
+    write_mesh(mesh, tmp_path / "ball.ply", measured=measured, color=color, confidence=sure)
     found = read_ply(tmp_path / "ball.ply")
+    np.testing.assert_array_equal(found.confidence, sure)
     np.testing.assert_allclose(found.mesh.vertices, mesh.vertices, atol=1e-6)
     np.testing.assert_array_equal(found.mesh.faces, mesh.faces)
     np.testing.assert_array_equal(found.measured, measured)
@@ -167,7 +169,7 @@ def test_ply_tells_what_was_measured_and_its_colours(tmp_path, painted):
     assert "property uchar measured" in header and "property uchar red" in header
     write_mesh(mesh, tmp_path / "ball.ply")
     plain = read_ply(tmp_path / "ball.ply")
-    assert plain.measured is None and plain.color is None
+    assert plain.measured is None and plain.color is None and plain.confidence is None
 
 
 def content_of_glb(path):

@@ -144,7 +144,9 @@ def build_mapper(
     parts = _Parts(
         prior,
         jax.random.key(seed),
-        reconstruct_jit(refiner, replace(search, iterations=mapping.keyframe_iterations)),
+        reconstruct_jit(
+            refiner, replace(search, iterations=mapping.keyframe_iterations, samples=0)
+        ),
         reconstruct_jit(refiner, search),
         mapping,
         track,

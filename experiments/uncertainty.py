@@ -1,0 +1,305 @@
+r"""Do probabilities come true? Reliability in occluded voxels, and what samples add.
+
+    python experiments/uncertainty.py --seats cad_chairs --tables cad_tables
+
+Shapes are completed from 1, 4 and 8 noisy frames of a Kinect along an orbit. Every way to say how
+sure a voxel is gets a calibration of its own, fitted to procedural chairs that nobody trained on
+and that are not in the test:
+
+- decoder: the logits of the shape, with slope and offset (Platt scaling);
+- conditional prior: the slope falls with the spread of 16 shapes whose codes are drawn from the
+  conditional network's prior (the package's way);
+- auto-encoder, decoder: the same as the first, of the paper's network after 60 steps of Adam;
+- auto-encoder, curvature: samples by Laplace's approximation from the Gauss-Newton matrix;
+- auto-encoder, CMA-ES: samples from the covariance matrix C of CMA-ES after 60 generations, scaled
+  by the factor among three that makes the calibration chairs most probable.
+
+The auto-encoder's rows are of 4 frames and of fewer objects, for each takes a search.
+
+Results: experiments/results/uncertainty.json, .png and uncertainty_hypotheses.png.
+Time: about half an hour on two cores.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from jaxshape.data.families import procedural_objects
+from jaxshape.files import atomic_path, write_json
+from jaxshape.geometry.grids import Grids
+from jaxshape.model.calibration import Calibration
+from jaxshape.model.shapes import ShapePrior, decode, encode
+from jaxshape.model.weights import load_prior
+from jaxshape.report.figures import tidy
+from jaxshape.report.panels import grid_panel
+from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys
+from jaxshape.results.metrics import reliability
+from jaxshape.search.calibrating import fit
+from jaxshape.search.composition import complete
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.posterior import hypotheses
+from jaxshape.search.reconstruction import reconstruct, refiner_for, residual_for
+from jaxshape.search.run import refine
+from jaxshape.search.space import whitened
+from study import Subject, listed, observed
+
+RESULTS = Path(__file__).parent / "results"
+FRAMES = (1, 4, 8)
+SEEN = EvaluateConfig(frames=FRAMES, camera="kinect", noise=True)
+SAMPLES, STEPS = 16, 60
+FIRST_SEED = 500_000
+"""Seed of the first chair that calibrations are fitted to: between training and test."""
+SCALES = (0.1, 0.3, 1.0)
+"""Factors of CMA-ES's matrix, whose own scale has shrunk by the end of a search."""
+AT_A_TIME = 6
+
+
+@dataclass(frozen=True)
+class Config:
+    seats: Path = Path("cad_chairs")
+    """Folder of the CAD seats."""
+    tables: Path | None = None
+    """Folder of the CAD tables; without it they are left out."""
+    chairs: int = 96
+    """Procedural chairs kept for tests."""
+    calibration: int = 48
+    """Procedural chairs that calibrations are fitted to."""
+    searched: int = 12
+    """Calibration chairs and CAD seats of the auto-encoder's rows."""
+    weights: Path | None = None
+    """Weights of the conditional network; those of the package where not given."""
+    output: Path = RESULTS
+    """Folder of the results."""
+
+
+class Voxels(NamedTuple):
+    """Occluded voxels of some objects after some number of frames, one after the other."""
+
+    logits: np.ndarray
+    spread: np.ndarray
+    occupied: np.ndarray
+
+
+Predictor = Callable[[ShapePrior, Any, Grids], tuple[jax.Array, jax.Array]]
+
+# ------------------------------------------------------------------ ways to say how sure
+
+
+def conditional(prior: ShapePrior, keys, grids: Grids) -> tuple[jax.Array, jax.Array]:
+    """The first code's shape, and the spread of samples of the conditional prior."""
+    config = RefineConfig(samples=SAMPLES)
+    found = reconstruct(keys, prior, grids.occupied, grids.occluded, None, config)
+    return found.fill_logits, jnp.std(found.samples, axis=1)
+
+
+def curvature(prior: ShapePrior, keys, grids: Grids) -> tuple[jax.Array, jax.Array]:
+    """Adam's shape, and the spread of samples by Laplace's approximation about it."""
+    config = RefineConfig(samples=SAMPLES, iterations=STEPS)
+    adam = refiner_for("gradient:adam", prior, config)
+    found = reconstruct(keys, prior, grids.occupied, grids.occluded, adam, config)
+    return found.fill_logits, jnp.std(found.samples, axis=1)
+
+
+def covariance(scale: float, prior: ShapePrior, keys, grids: Grids):
+    """The shape of CMA-ES's mean, and the spread of samples from its covariance matrix."""
+    config, space = RefineConfig(iterations=STEPS), whitened(prior)
+    residual, first = residual_for(grids, config), encode(prior, grids)
+    target = jax.vmap(residual.target)(grids, decode(prior, first, grids))
+    search = refiner_for("cma", prior, config)
+    found = refine(keys, prior, first, target, search, STEPS, residual=residual, space=space)
+    mean, C = found.state.mean, found.state.covariance
+    size = jnp.trace(C, axis1=1, axis2=2)[:, None, None] / C.shape[-1]
+    root = scale * jnp.linalg.cholesky(C / size)
+    noise = jax.random.normal(keys[0], (len(mean), SAMPLES, C.shape[-1]))
+    points = mean[:, None] + jnp.einsum("oij,osj->osi", root, noise)
+    logits = decode(prior, jax.vmap(jax.vmap(space.to_code))(points))
+    fill = partial(complete, symmetry=True)
+    each = Grids(*(jnp.broadcast_to(x[:, None], logits.shape) for x in grids[:2]))
+    here = fill(grids, decode(prior, jax.vmap(space.to_code)(mean))).logits
+    return here, jnp.std(fill(each, logits).logits, axis=1)
+
+
+# ------------------------------------------------------------------ voxels and figures
+
+
+def cases_of(objects: Sequence[Any]) -> list[tuple[str, Case]]:
+    subjects = [Subject(one.name, "", one) for one in objects]
+    return [(subject.name, case) for subject, case in observed(subjects, SEEN)]
+
+
+def voxels(
+    predictor: Predictor, prior: ShapePrior, cases: list[tuple[str, Case]], frame: int
+) -> Voxels:
+    """The occluded voxels of all cases after the frame-th number of frames."""
+    run, parts = jax.jit(predictor), []
+    for first in range(0, len(cases), AT_A_TIME):
+        some = cases[first : first + AT_A_TIME]
+        rows = [some[i % len(some)] for i in range(AT_A_TIME)]
+        grids = Grids(*(jnp.stack([jnp.float32(case.grids[i][frame]) for _, case in rows])
+                        for i in (0, 1)))  # fmt: skip
+        keys = jnp.concatenate([case_keys(name, FRAMES[frame : frame + 1]) for name, _ in rows])
+        logits, spread = jax.device_get(run(prior, keys, grids))
+        for i, (_, case) in enumerate(some):
+            hidden = np.asarray(case.grids.occluded[frame]) > 0.5
+            truth = np.asarray(case.surface[frame])[hidden]
+            parts.append(Voxels(logits[i][hidden], spread[i][hidden], truth))
+    return Voxels(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def nats(found: Voxels, calibration: Calibration) -> float:
+    """Mean negative log-likelihood of a voxel."""
+    p = np.clip(probability(found, calibration), 1e-7, 1 - 1e-7)
+    return float(-np.log(np.where(found.occupied, p, 1 - p)).mean())
+
+
+def probability(found: Voxels, calibration: Calibration) -> np.ndarray:
+    return np.asarray(calibration.probability(jnp.asarray(found.logits), jnp.asarray(found.spread)))
+
+
+def figures_of(found: Voxels, calibration: Calibration) -> dict[str, Any]:
+    seen = reliability(probability(found, calibration), found.occupied)
+    return {
+        "ece": round(seen.error, 4),
+        "nats": round(nats(found, calibration), 4),
+        "curve": {name: np.round(x, 4).tolist() for name, x in seen._asdict().items()},
+    }
+
+
+def without_spread(found: Voxels) -> Voxels:
+    return found._replace(spread=np.zeros_like(found.spread))
+
+
+def pooled(parts: Sequence[Voxels]) -> Voxels:
+    return Voxels(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+# ------------------------------------------------------------------ the comparison
+
+
+def compared(config: Config, sets: dict[str, list], chairs: list) -> dict[str, Any]:
+    """Figures of the conditional network, by set, number of frames and way."""
+    prior = load_prior(config.weights)
+    look = partial(voxels, conditional, prior)
+    calibrating = pooled([look(chairs, i) for i in range(len(FRAMES))])
+    ways = {
+        "decoder as it is": (without_spread, Calibration()),
+        "decoder": (without_spread, fit(*without_spread(calibrating))),
+        "conditional prior": (lambda x: x, fit(*calibrating)),
+    }
+    figures: dict[str, Any] = {}
+    for name, cases in sets.items():
+        for i, k in enumerate(FRAMES):
+            found = look(cases, i)
+            for way, (view, calibration) in ways.items():
+                row = figures_of(view(found), calibration)
+                figures.setdefault(name, {}).setdefault(str(k), {})[way] = row
+                print(f"{name}, {k} frames, {way}: ECE {row['ece']:.3f}, {row['nats']:.4f} nats")
+    return {
+        "figures": figures,
+        "calibrations": {way: list(c) for way, (_, c) in ways.items()},
+    }
+
+
+def searched(seats: list, chairs: list) -> dict[str, Any]:
+    """Figures of the auto-encoder's ways after 4 frames."""
+    prior, rows, frame = load_prior("chair-autoencoder"), {}, FRAMES.index(4)
+    found = {"curvature": [voxels(curvature, prior, x, frame) for x in (chairs, seats)]}
+    found["decoder"] = [without_spread(x) for x in found["curvature"]]
+    tried = {s: voxels(partial(covariance, s), prior, chairs, frame) for s in SCALES}
+    best = min(SCALES, key=lambda s: nats(tried[s], fit(*tried[s])))
+    found["CMA-ES"] = [tried[best], voxels(partial(covariance, best), prior, seats, frame)]
+    for way, (fitted, tested) in found.items():
+        rows[f"auto-encoder, {way}"] = figures_of(tested, fit(*fitted))
+        print(f"auto-encoder, {way}: ECE {rows[f'auto-encoder, {way}']['ece']:.3f}")
+    return {"frames": 4, "seats": len(seats), "scale": best, "figures": rows}
+
+
+def two_kinds(config: Config, cases: list[tuple[str, Case]], path: Path) -> str:
+    """Draw the object whose hypotheses differ most after one frame, and their blurred mean."""
+    prior, search = load_prior(config.weights), RefineConfig(samples=SAMPLES)
+
+    @jax.jit
+    def look(keys, grids):
+        found = reconstruct(keys, prior, grids.occupied, grids.occluded, None, search)
+        unknown = grids.occluded[0] > 0.5
+        chosen, share = hypotheses(found.samples[0], unknown, 2)
+        a, b = ((found.samples[0, i] > 0) & unknown for i in chosen)
+        apart = 1 - jnp.sum(a & b) / jnp.maximum(jnp.sum(a | b), 1)
+        return found, chosen, share, apart * 2 * jnp.min(share)
+
+    best: tuple[float, Any, Any] = (-1.0, None, None)
+    for name, case in cases:
+        grids = Grids(*(jnp.float32(x[:1]) for x in case.grids[:2]))
+        found = jax.device_get(look(case_keys(name, FRAMES[:1]), grids))
+        if found[3] > best[0]:
+            best = float(found[3]), (name, case), found
+    _, (name, case), (found, chosen, share, _) = best
+    F = np.asarray(case.grids.occupied[0]) * (1 - np.asarray(case.grids.occluded[0])) > 0.5
+    shown = {f"hypothesis {i + 1}: {s:.0%}": found.samples[0, c] > 0
+             for i, (c, s) in enumerate(zip(chosen, share, strict=True))}  # fmt: skip
+    shown["probability above 1/2"] = found.probability[0] > 0.5
+    shown["truth"] = np.asarray(case.surface[0])
+    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    for i, (title, grid) in enumerate(shown.items()):
+        axes = figure.add_subplot(1, 4, i + 1)
+        labels = np.where(F, 1, np.where(grid, 2, 0))
+        axes.imshow(grid_panel("", labels, "measured", "predicted").image)
+        axes.set_title(title, fontsize=9)
+        axes.set_axis_off()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130, format="png")
+    return name
+
+
+def plot(figures: dict[str, Any], path: Path) -> None:
+    """Reliability curves: what came true against what was said."""
+    figure = Figure(figsize=(3.4 * len(FRAMES), 3.2 * len(figures)), layout="constrained")
+    panels = figure.subplots(len(figures), len(FRAMES), squeeze=False, sharex=True, sharey=True)
+    for row, (name, by_frames) in zip(panels, figures.items(), strict=True):
+        for axes, (k, ways) in zip(row, by_frames.items(), strict=True):
+            axes.plot([0, 1], [0, 1], color="0.8", lw=1)
+            for i, (way, one) in enumerate(ways.items()):
+                x, y, share = (
+                    np.array(one["curve"][c]) for c in ("predicted", "occurred", "share")
+                )
+                some = share > 1e-3
+                axes.plot(x[some], y[some], marker="o", ms=3, color=f"C{i}",
+                          label=f"{way}: ECE {one['ece']:.3f}")  # fmt: skip
+            axes.set_title(f"{name}, {k} frame{'s' * (k != '1')}", fontsize=9)
+            axes.legend(frameon=False, fontsize=6.5, loc="upper left")
+            tidy(axes)
+    for axes in panels[-1]:
+        axes.set_xlabel("probability that was given")
+    for row in panels:
+        row[0].set_ylabel("share that is occupied")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130, format="png")
+
+
+def main() -> None:
+    config = tyro.cli(Config)
+    chairs = cases_of(procedural_objects("chair", config.calibration, FIRST_SEED))
+    sets = {"CAD seats": cases_of(listed(config.seats, 0))}
+    if config.tables is not None:
+        sets["CAD tables"] = cases_of(listed(config.tables, 0))
+    if config.chairs:
+        sets["procedural chairs"] = cases_of(listed(None, config.chairs))
+    found = compared(config, sets, chairs)
+    few = config.searched
+    found["auto-encoder"] = searched(sets["CAD seats"][:few], chairs[:few]) if few else None
+    config.output.mkdir(parents=True, exist_ok=True)
+    name = two_kinds(config, sets["CAD seats"], config.output / "uncertainty_hypotheses.png")
+    write_json(config.output / "uncertainty.json", found | {"two kinds": name})
+    plot(found["figures"], config.output / "uncertainty.png")
+
+
+if __name__ == "__main__":
+    main()
