@@ -37,13 +37,24 @@ from .mapping.placement.finding import Start, find_start
 from .mapping.placement.placing import Placement, PlacementConfig, place
 from .mapping.segmentation.segment import Prompt, Segmentation, segment
 from .mapping.tracking.keyframes import PreparedFrame
+from .model.calibration import Calibration
 from .model.config import Architecture
 from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
 from .model.weights import load_prior, save_prior
 from .report.page import write_report
 from .results.fused_surface import FusedSurface, fuse_surface
-from .results.metrics import Bounds, ShapeScores, bounds, chamfer_l1, f_score, shape_scores
+from .results.metrics import (
+    Bounds,
+    Reliability,
+    ShapeScores,
+    bounds,
+    chamfer_l1,
+    f_score,
+    reliability,
+    shape_scores,
+)
 from .results.surface import surface, write_mesh
+from .search.calibrating import fit_calibration
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
 from .search.composition import Composition, complete, compose
 from .search.config import RefineConfig
@@ -55,6 +66,7 @@ from .search.methods.gauss_newton import gauss_newton
 from .search.methods.gradient import gradient
 from .search.methods.hybrid import polished
 from .search.objective import objective
+from .search.posterior import hypotheses, sample_codes
 from .search.reconstruction import (
     Reconstruction,
     fit_surface,
@@ -95,6 +107,7 @@ __all__ = [
     "BALANCED",
     "Bounds",
     "Box",
+    "Calibration",
     "Candidate",
     "Capture",
     "CmaState",
@@ -124,6 +137,7 @@ __all__ = [
     "RefineConfig",
     "Refined",
     "Refiner",
+    "Reliability",
     "Residual",
     "SOFT",
     "Segmentation",
@@ -169,12 +183,14 @@ __all__ = [
     "finite_or_inf",
     "fit_box",
     "fit_box_isotropic",
+    "fit_calibration",
     "fit_surface",
     "follow",
     "fuse_frames",
     "fuse_surface",
     "gauss_newton",
     "gradient",
+    "hypotheses",
     "iou",
     "keep_better",
     "load",
@@ -201,6 +217,8 @@ __all__ = [
     "reconstruct",
     "refine",
     "refiner_for",
+    "reliability",
+    "sample_codes",
     "save_prior",
     "segment",
     "sensor_of",

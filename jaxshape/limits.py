@@ -113,3 +113,6 @@ FREE_BYTES = 64 * MIB
 
 CACHE_BYTES = 2 * GIB
 """Size of all compiled programs that are kept; the oldest are removed."""
+
+OBJECTS = 100_000_000
+"""Objects of a dataset."""

@@ -1,6 +1,5 @@
 """`jaxshape dataset` and `jaxshape train`: from objects to a shape prior."""
 
-import json
 import os
 import re
 import shlex
@@ -29,6 +28,7 @@ from jaxshape.data.config import DatasetConfig, FamilyName
 from jaxshape.files import write_json, write_text
 from jaxshape.model.config import TrainConfig
 from jaxshape.process import spread_over_cores
+from jaxshape.reading import read_json_object
 from jaxshape.search.config import RefineConfig
 
 OWN_MESHES = DatasetConfig(paths=4)
@@ -218,7 +218,7 @@ class Train:
         data = open_dataset(folder)
         prior = self.fit(output, data, start)
         if prior is not None:
-            about = json.loads((folder / "dataset.json").read_text())
+            about = read_json_object(folder / "dataset.json")
             about |= {"source": str(self.meshes or self.dataset), "used": len(data.names)}
             self.write(output, prior, about, held_out)
 

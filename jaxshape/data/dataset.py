@@ -9,16 +9,16 @@ voxel, of which 4 bits are the probability of surface and 4 that of free space, 
 `building` makes datasets; here is what one object becomes, and how a finished dataset is read.
 """
 
-import json
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import trimesh
 from jaxtyping import Bool, UInt8
 
+from jaxshape import limits, reading
 from jaxshape.data import meshes
 from jaxshape.data.archives import MeshSource
 from jaxshape.data.config import DatasetConfig, UnitName
@@ -184,18 +184,20 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
         folder: Folder of the dataset.
 
     Raises:
-        DatasetError: There is no dataset, or a part of it is missing.
+        DatasetError: There is no dataset, or a part of it is missing or damaged.
     """
     folder = Path(folder)
     if not (folder / "dataset.json").exists():
         raise DatasetError(f"There is no dataset in {str(folder)!r}; make one: jaxshape dataset.")
-    claim = json.loads((folder / "dataset.json").read_text())
+    claim = _read(folder / "dataset.json")
     if claim.get("format") != FORMAT:
         raise DatasetError(
             f"{str(folder)!r} holds a dataset of an earlier version of jaxshape; build it again: "
             "jaxshape dataset."
         )
-    count = claim["objects"]
+    count = claim.get("objects")
+    if not isinstance(count, int) or not 0 < count <= limits.OBJECTS:
+        raise DatasetError(f"{str(folder)!r} is damaged: it claims {count!r} objects.")
     expected = -(-count // OBJECTS_PER_SHARD)
     missing = [n for n in range(expected) if not shard_path(folder, n, "json").exists()]
     if missing:
@@ -206,12 +208,37 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     names, row = [], []
     arrays: dict[str, list[np.ndarray]] = {kind: [] for kind in KINDS}
     for number in range(expected):
-        inside = json.loads(shard_path(folder, number, "json").read_text())["names"]
+        inside = _read(shard_path(folder, number, "json")).get("names", [])
         names += inside
         row += [(number, place) for place in range(len(inside))]
         for kind in KINDS:
-            path = shard_path(folder, number, f"{kind}.npy")
-            arrays[kind].append(np.load(path, mmap_mode="r"))
+            arrays[kind].append(_mapped(shard_path(folder, number, f"{kind}.npy"), len(inside)))
     if not names:
         raise DatasetError(f"Every object of the dataset in {str(folder)!r} was skipped.")
     return Dataset(names, arrays["surface"], arrays["measured"], row)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return reading.read_json_object(path)
+    except (OSError, ValueError) as problem:
+        raise DatasetError(
+            f"{str(path)!r} is damaged ({problem}); build the dataset again."
+        ) from None
+
+
+def _mapped(path: Path, count: int) -> np.ndarray:
+    """The array of a shard of so many objects, left on disk."""
+    try:
+        array = np.load(path, mmap_mode="r")
+    except (OSError, ValueError) as problem:
+        raise DatasetError(
+            f"{str(path)!r} is damaged ({problem}); build the dataset again."
+        ) from None
+    if array.dtype != np.uint8 or len(array) != count:
+        raise _damaged(path, f"it holds {array.shape} {array.dtype}, its shard has {count} objects")
+    return array
+
+
+def _damaged(path: Path, problem: Any) -> DatasetError:
+    return DatasetError(f"{str(path)!r} is damaged ({problem}); build the dataset again.")

@@ -11,6 +11,7 @@ from jaxshape.data import building, dataset, paths
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.building import build_dataset
 from jaxshape.data.dataset import (
+    FORMAT,
     OBJECTS_PER_SHARD,
     DatasetConfig,
     DatasetError,
@@ -250,4 +251,26 @@ def test_a_dataset_of_an_earlier_version_is_named(copied):
     del claim["format"]
     (copied / "dataset.json").write_text(json.dumps(claim))
     with pytest.raises(DatasetError, match="earlier version .* build it again"):
+        open_dataset(copied)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("dataset.json", b"{"),
+        ("dataset.json", b'{"format": "' + FORMAT.encode() + b'", "objects": -4}'),
+        ("shard-00000.json", b"[" * 100_000),
+        ("shard-00000.surface.npy", b"no array"),
+    ],
+)
+def test_a_damaged_file_is_named(copied, name, content):
+    (copied / name).write_bytes(content)
+    with pytest.raises(DatasetError, match="is damaged"):
+        open_dataset(copied)
+
+
+def test_an_array_of_fewer_objects_than_its_names_is_refused(copied):
+    path = copied / "shard-00000.measured.npy"
+    np.save(path, np.load(path)[:-1])
+    with pytest.raises(DatasetError, match="measured.npy.*its shard has"):
         open_dataset(copied)
