@@ -88,8 +88,8 @@ def unproject(
             ray met nothing.
 
     Returns:
-        Points `[*batch h w 3]`, in metres; at 0 for pixels of depth 0, and at infinity for those of
-        infinite depth.
+        Points `[*batch h w 3]`, in metres; 0 for pixels of depth 0, infinite for pixels of infinite
+        depth.
     """
     h, w = depth.shape[-2:]
     u, v = jnp.arange(w) + 0.5, jnp.arange(h) + 0.5

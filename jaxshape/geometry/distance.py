@@ -7,8 +7,8 @@ distances average a sensor's noise away.
 
 Two things keep thin parts alive. Behind a surface, where a frame knows nothing, its distances count
 only within a narrow band and less with every millimetre, so that a plate seen from both sides keeps
-both. And what rays passed through is counted apart, so that the rays that pass beside a leg do not
-pull at its surface.
+both. Space that rays passed through is counted apart, so that rays passing a chair leg do not shift
+its surface.
 """
 
 from typing import NamedTuple
@@ -39,12 +39,13 @@ class Band(NamedTuple):
 
 
 FRONT, BEHIND, CLEAR = Band(3.0, 3.0), Band(1.8, 2.0), Band(1.0, 2.0)
-"""How far in front of a surface and, fading, behind it a frame counts, and from where on space is
-free for certain. Plates of 2 cm seen from both sides keep their thickness to 0.3 mm."""
+"""Width of the band in front of a surface and of the fading band behind it, and the distance in
+front of it beyond which space is certainly free. Plates of 2 cm seen from both sides keep their
+thickness to 0.3 mm."""
 
 
 class DistanceField(NamedTuple):
-    """What a set of frames says about each fine voxel.
+    """Signed distances and free space that a set of frames measured, for each fine voxel.
 
     Attributes:
         weighted_distance: Sum over frames of weight times signed distance, in metres; positive in
@@ -81,16 +82,17 @@ def measure(
     """Signed distances from the surface that one depth frame shows.
 
     Every fine voxel looks up the pixel that its centre projects to, so that a pixel is a patch and
-    a coarse image leaves no holes. Its distance is that to the plane through the pixel's surface.
+    a coarse image leaves no holes. Its distance is measured to the plane through the pixel's
+    surface.
 
     Args:
         depth: Metres; 0 where nothing is known, infinite where the ray met nothing.
-        segmented: True on pixels that show the object. Others make no surface; every valid pixel
-            frees the space in front of it.
-        intrinsics: Of the depth image.
+        segmented: True on pixels that show the object. Other pixels make no surface; every valid
+            pixel frees the space in front of it.
+        intrinsics: Camera of the depth image.
         T_object_camera: Camera to object.
-        frame: Of the grid of shapes, 32 voxels along each side.
-        sensor: How its noise grows, which decides weights and bands.
+        frame: Frame of the grid of shapes, 32 voxels along each side.
+        sensor: Noise of the camera, which decides weights and bands.
         resolution: Fine voxels along each side.
 
     Returns:
@@ -99,8 +101,8 @@ def measure(
     fine = fine_frame(frame, resolution)
     index, z = _project(intrinsics, T_object_camera, fine, resolution, depth.shape)
     pixels = surface_pixels(depth, segmented, intrinsics, sensor)
-    # The last entry stands for all that lies outside the image. A scatter writes it: XLA fuses
-    # nothing across scatters, where otherwise it would fit a plane for every voxel.
+    # The last entry stands for everything outside the image. A scatter writes it: XLA does not fuse
+    # across scatters; without one it would fit a plane for every voxel.
     packed = jnp.append(pack(pixels), jnp.uint32(0))
     packed = packed.at[jnp.full(2, depth.size)].set(jnp.uint32(0))
     found = unpack(packed.at[index].get(mode="promise_in_bounds"))

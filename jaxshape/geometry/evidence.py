@@ -1,4 +1,4 @@
-"""How likely each voxel of a shape is surface, free or unknown, from its fine signed distances.
+"""Probability that each voxel of a shape is surface, free or unknown, from fine signed distances.
 
 The numbers below were fitted to procedural chairs under a Kinect's noise, after 1 to 18 frames: how
 often a voxel with so many crossings, or so much free space, holds a piece of the true surface.
@@ -26,7 +26,7 @@ SOME, ALL = 0.5, 0.95
 
 
 class Evidence(NamedTuple):
-    """What the frames say about each voxel; the rest of the probability is unknown.
+    """Probabilities of each voxel given the frames; the rest of the probability is unknown.
 
     Attributes:
         surface: Probability, 0 to 1, that the voxel holds a piece of the measured surface.
@@ -76,7 +76,8 @@ def crossings(field: DistanceField) -> Bool[Array, "*batch x y z"]:
 
 
 def _within_margin(count: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
-    """Crossings in the outermost voxels, which the box leaves free, as of those next to them.
+    """Crossings in the outermost voxels, which the box leaves free, count for the voxels next to
+    them.
 
     The box's own faces lie a hundredth of a voxel inside: noise alone takes a surface across.
     """
@@ -92,7 +93,7 @@ def _within_margin(count: Float[Array, "*batch x y z"]) -> Float[Array, "*batch 
 
 
 def as_grids(evidence: Evidence) -> Grids:
-    """F and M as probabilities: that of surface among the known voxels, and of unknown ones."""
+    """F and M as probabilities: of surface given that a voxel is known, and of being unknown."""
     known = evidence.surface + evidence.free
     return Grids(evidence.surface / jnp.where(known > 0, known, 1), 1 - known)
 

@@ -159,7 +159,7 @@ def fuse(
         intrinsics: The camera of all frames.
         T_object_camera: Pose of each frame in the object frame `[frame]`.
         frame: Voxel frame of F and M.
-        sensor: How the camera's noise grows.
+        sensor: Noise of the camera.
         state: The state of earlier frames; None where there are none.
     """
 
@@ -194,7 +194,7 @@ def fuse_in_stages(
         intrinsics: The camera of all frames.
         T_object_camera: Pose of each frame in the object frame `[frame]`.
         frame: Voxel frame of F and M.
-        sensor: How the camera's noise grows.
+        sensor: Noise of the camera.
 
     Yields:
         The states, in the order of the numbers.

@@ -50,8 +50,8 @@ def measure(
 ) -> Measurement:
     """Discretise one depth frame: `D(T P)` of Eq. 6, and the space it looked through.
 
-    Only segmented pixels put points into voxels. Every valid pixel looks through the space in front
-    of it: background frees space, and a foreign object in front keeps what is behind it occluded.
+    Only segmented pixels put points into voxels. Every valid pixel frees the space in front of it,
+    background pixels too; the space behind a foreign object stays occluded.
 
     Args:
         depth: Depth image `[h w]`, in metres; 0 where nothing is known, infinite where the ray met
@@ -65,8 +65,8 @@ def measure(
     Returns:
         The measurement of this frame `[x y z]`.
     """
-    # One affine map each way, and coordinates in arrays of their own: whatever happens to a pixel
-    # or a voxel before it is counted or looked up is then one pass, many times as fast on CPU.
+    # One affine map each way, with separate arrays for the coordinates: XLA then does everything
+    # before the count or look-up in one pass, many times as fast on CPU.
     R, t = T_object_camera.rotation().as_matrix(), T_object_camera.translation()
     voxel_from_camera = R / frame.voxel_size[:, None], (t - frame.origin) / frame.voxel_size
     camera_from_voxel = R.T * frame.voxel_size, R.T @ (frame.origin - t)

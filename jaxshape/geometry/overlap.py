@@ -26,7 +26,7 @@ def iou(
         One number from 0 to 1 for each pair of grids `[*batch]`.
 
     Raises:
-        ValueError: A grid holds anything else, such as probabilities or logits. Under `jax.jit` the
+        ValueError: A grid holds other values, such as probabilities or logits. Under `jax.jit` the
             values of integers are not known: there, all but 0 is occupied.
     """
     a, b = _occupied(predicted, "predicted"), _occupied(truth, "truth")

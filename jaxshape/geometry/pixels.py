@@ -1,6 +1,6 @@
-"""What each pixel of a depth image says about the surface it shows: depth, and slope.
+"""Depth and slope of the surface that each pixel of a depth image shows.
 
-A pixel at a depth jump shows no surface: its depth may be that of either side, or of neither.
+A pixel at a depth jump shows no surface: its depth may belong to either side or to neither.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ STEEPEST = 0.1
 
 @dataclass(frozen=True)
 class Sensor:
-    """How well a depth camera measures.
+    """Noise of a depth camera.
 
     Attributes:
         axial: Standard deviation of depth, in metres at 1 m; grows with the square of depth.
@@ -103,7 +103,7 @@ GREATEST = 2.0
 """Slope in the corner of an image of 120 degrees; on the axis it is 1 at most."""
 
 SLOPE_BITS = 8
-"""Of the 32 that hold a pixel: 15 of the mantissa are left for depth, 0.06 mm at 2 m."""
+"""Bits of the slope, among the 32 of a pixel: depth keeps 15 bits of mantissa, 0.06 mm at 2 m."""
 
 
 def pack(pixels: SurfacePixels) -> UInt32[Array, "*n"]:

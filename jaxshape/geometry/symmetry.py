@@ -1,4 +1,4 @@
-"""Left and right of an object as evidence of each other, where what was measured of both agrees."""
+"""Each half of an object as evidence for the other, where the two measured halves agree."""
 
 from typing import NamedTuple
 
@@ -9,17 +9,17 @@ from jaxtyping import Array, Bool, Float
 from jaxshape.geometry.evidence import Evidence
 
 NATS = 3.0
-"""What a seen mirror image adds to the log-odds of an unknown voxel."""
+"""Nats that a measured mirror image adds to the log-odds of an unknown voxel."""
 
 AGREEMENT = 0.8
 """Share of the surface measured on both sides that must agree: most chairs reach .9."""
 
 
 class Mirrored(NamedTuple):
-    """What the other side of an object says.
+    """Evidence from the mirror image of an object.
 
     Attributes:
-        logits: Nats to add to those of a decoded shape, 0 where a voxel was seen itself.
+        logits: Nats to add to the logits of a decoded shape; 0 where the voxel itself was seen.
         symmetric: Whether both sides agree where both were measured; logits are 0 where not.
         agreement: The share of the surface measured on both sides that agrees; 1 without any.
     """
@@ -37,12 +37,13 @@ def mirror(x: Array | np.ndarray) -> Array:
 def mirrored(evidence: Evidence, nats: float = NATS) -> Mirrored:
     """Evidence about unknown voxels from their mirror images, where the object is symmetric.
 
-    A surface voxel that a grid places one voxel off still agrees: what contradicts symmetry is a
-    surface whose mirror image, and all that is next to it, was seen to be free.
+    A surface voxel that the grid places one voxel off still agrees. A surface contradicts symmetry
+    only where its mirror image and all voxels next to it were seen to be free.
 
     Args:
-        evidence: Of one object, in a frame whose x-axis points across the plane of symmetry.
-        nats: What a mirror image seen for certain adds.
+        evidence: Probabilities of one object, in a frame whose x-axis points across the plane of
+            symmetry.
+        nats: Nats that a mirror image seen with certainty adds.
 
     Returns:
         The nats, and how well the sides agree.
@@ -63,7 +64,7 @@ def mirrored(evidence: Evidence, nats: float = NATS) -> Mirrored:
 def symmetrised(
     logits: Float[Array, "*batch x y z"], found: Mirrored
 ) -> Float[Array, "*batch x y z"]:
-    """Logits averaged with their mirror image, plus what it showed; as given if not symmetric."""
+    """Logits averaged with their mirror image, plus its evidence; unchanged if not symmetric."""
     symmetric = found.symmetric[..., None, None, None]
     return jnp.where(symmetric, (logits + mirror(logits)) / 2, logits) + found.logits
 

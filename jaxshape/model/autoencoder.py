@@ -31,7 +31,7 @@ NORM_EPSILON = 1e-5
 """Added to variances by batch normalisation, Flax's default."""
 
 LEAKY_SLOPE = 0.2
-"""Not given in the paper; that of the networks whose initialisation it uses (DCGAN)."""
+"""Slope of the leaky ReLU. The paper gives none; DCGAN, whose initialisation it uses, has this."""
 
 
 class AutoEncoder(nn.Module):
@@ -40,8 +40,8 @@ class AutoEncoder(nn.Module):
     Attributes:
         architecture: Sizes of the network.
         dtype: Type of the arithmetic of convolutions; parameters and batch statistics stay float32.
-        axis: Mesh axis over which a batch is spread, so that its statistics are those of the whole
-            batch; None where it is not spread.
+        axis: Mesh axis over which a batch is spread, so that statistics cover the whole batch; None
+            where it is not spread.
     """
 
     architecture: Architecture = Architecture()
@@ -72,7 +72,7 @@ class AutoEncoder(nn.Module):
 class Encoder(nn.Module):
     """32 -> 16 -> 8 -> 4 -> 2 by strided convolutions, then pooling and a 1^3 convolution.
 
-    Each further layer takes a grid of twice the resolution. The fields are those of `AutoEncoder`.
+    Each further layer takes a grid of twice the resolution. Takes the fields of `AutoEncoder`.
     """
 
     architecture: Architecture
@@ -92,7 +92,7 @@ class Encoder(nn.Module):
 class Decoder(nn.Module):
     """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions; each further layer doubles again.
 
-    The fields are those of `AutoEncoder`.
+    Takes the fields of `AutoEncoder`.
     """
 
     architecture: Architecture
@@ -195,7 +195,7 @@ class PreparedDecoder(NamedTuple):
     Attributes:
         first: Kernel of the first layer, from a code to 4^3 voxels.
         kernels: Prepared kernels of the further layers.
-        biases: One bias for each layer; the last is that of the output, a scalar.
+        biases: One bias for each layer; the last, a scalar, belongs to the output.
     """
 
     first: Float[Array, "4 4 4 channels d"]

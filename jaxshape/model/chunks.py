@@ -12,8 +12,8 @@ from jaxtyping import Array, PyTree
 def in_chunks(function: Callable[..., PyTree], size: int, *examples: Array) -> PyTree:
     """Apply a batched function to at most `size` examples at a time.
 
-    All chunks are equally large, so that the function is compiled once; the last is filled up with
-    zeros, whose results are dropped.
+    All chunks have the same size, so that the function is compiled once; zeros pad the last one,
+    and their results are dropped.
     """
     b = examples[0].shape[0]
     chunks = -(-b // size)
@@ -39,7 +39,7 @@ def sum_chunks(function: Callable[..., Array], size: int, *examples: Array) -> A
 
 
 def vary_like(tree: PyTree, example: Array) -> PyTree:
-    """The same arrays, as different on each device of a `jax.shard_map` as an example is.
+    """The same arrays, varying over the devices of a `jax.shard_map` wherever an example does.
 
     Loops want their first state to be of the type of the later ones, and under `jax.shard_map` that
     says along which axes of the mesh an array may differ.

@@ -1,10 +1,11 @@
-"""A network conditioned on what was measured: detail passes by the code, which carries the rest.
+"""A network conditioned on the measurement: measured detail bypasses the code.
 
 `COMPLETION` is its `ShapeModel`, a conditional variational auto-encoder with the skip connections
-of a U-Net. What was measured (soft F and M) goes down from 16^3 to 4^3 voxels of features, once for
-each object; a code joins them at 4^3 and on the way up again, where the features come in at each
-size. Codes of all objects are normally distributed with mean 0 and variance 1, given what was
-measured, so that the first code is 0 and half the squared length of a code is its cost in nats.
+of a U-Net. The measurement (soft F and M) goes down from 16^3 to 4^3 voxels of features, once for
+each object. A code joins them at 4^3 and on the way up again, where skip connections add the
+features of each size. Given the measurement, codes of all objects are normally distributed with
+mean 0 and variance 1, so that the first code is 0 and half the squared length of a code is its cost
+in nats.
 
 In training a posterior network sees the complete shape too and says which codes lead to it.
 """
@@ -34,7 +35,7 @@ Features = Float[Array, "b x y z channels"]
 
 
 class Skips(NamedTuple):
-    """Features of what was measured, from fine to coarse.
+    """Features of the measurement, from fine to coarse.
 
     Attributes:
         fine: At half the resolution of the grids.
@@ -167,8 +168,8 @@ def _spread(x: Float[Array, "b x y z c"]) -> Float[Array, "b 2*x 2*y 2*z c//8"]:
 def evidence_of(grids: Grids) -> Float[Array, "b x y z 4"]:
     """Probabilities of measured surface and of free space, there and at the mirror image.
 
-    Many objects are symmetric. What was measured on one side of them is then known of the other,
-    and the network learns how far to believe it.
+    Many objects are symmetric. Each side then carries the measurement of the other one as well, and
+    the network learns how far to believe it.
     """
     seen = from_grids(grids)
     return jnp.stack([*seen, *map(mirror, seen)], axis=-1)
@@ -219,14 +220,14 @@ def posterior(
 
 
 def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
-    """The most probable code given what was measured: 0."""
+    """The most probable code given the measurement: 0."""
     return jnp.zeros((len(grids.occupied), architecture_of(params).code))
 
 
 def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
     """Features of each object's measurement and of its mirror image.
 
-    Without a measurement, those of an object of which nothing is known.
+    Without a measurement, all voxels are unknown.
     """
     if grids is None:
         n = architecture_of(params).resolution
@@ -267,4 +268,4 @@ def shapes(params: PyTree) -> PyTree:
 
 
 COMPLETION = ShapeModel("completion", encode, decode, prepare, shapes, conditional=True)
-"""Conditional network whose decoder takes what was measured."""
+"""Conditional network whose decoder takes the measurement."""

@@ -59,7 +59,7 @@ class Architecture:
 
 @dataclass(frozen=True)
 class Completion:
-    """Sizes of the network that is conditioned on what was measured (`model/completion`).
+    """Sizes of the network that is conditioned on the measurement (`model/completion`).
 
     Attributes:
         channels: Channels at a half, a quarter and an eighth of the resolution, each 1 or more.
@@ -100,11 +100,11 @@ class TrainConfig:
     Attributes:
         architecture: Sizes of the network, and with them its kind: the conditional network, or the
             paper's auto-encoder.
-        inputs: How pairs are drawn from the dataset.
+        inputs: Settings by which pairs are drawn from the dataset.
         steps: Batches in all, 1 or more.
         batch: Pairs in a batch, over all devices, 1 or more.
-        optimizer: Adam (paper), or Muon, which orthogonalises the steps of the kernels: it reaches
-            in a third of the samples what Adam reaches.
+        optimizer: Adam (paper), or Muon, which orthogonalises the steps of the kernels and needs a
+            third of the samples.
         learning_rate: Peak of the optimiser's step size, above 0 (paper: 1e-4, of Adam).
         schedule: Whether the step size warms up and decays to zero along a cosine, or stays
             constant (paper).
@@ -115,15 +115,15 @@ class TrainConfig:
             these is better than at 0.5.
         occluded_weight: Weight of occluded voxels in the loss, above 0 (paper: 1).
         code_noise: Standard deviation of noise added to the codes of an auto-encoder, 0 or more.
-        code_weight: Weight of what a code costs, 0 or more: of the KL divergence of the conditional
-            network's codes, and of half the squared length, in nats, of an auto-encoder's, which
-            with noise of 1 is the divergence of a posterior of variance 1.
+        code_weight: Weight of the code penalty, 0 or more. The penalty is the KL divergence of a
+            conditional network's codes, and half the squared length, in nats, of an auto-encoder's;
+            with noise of 1 the latter is the divergence of a posterior of variance 1.
         posterior_share: Share of each batch for which the conditional network decodes a code of the
             posterior, from 0 to 1; the others decode its first code. At 0 codes mean nothing.
         bfloat16: Compute convolutions in bfloat16: the conditional network is then trained 3 to 4
             times as fast where the processor has matrix units for it. Parameters, statistics and
             the optimiser stay in float32.
-        validation: How many of the dataset's last objects are kept out of training and completed
+        validation: Number of the dataset's last objects that are kept out of training and completed
             for each report, 0 or more; at most a tenth of them.
         report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
             on from the last checkpoint.
@@ -186,5 +186,5 @@ PRESETS = {
         validation=0,
     ),
 }
-"""Training runs by name: what we found best, the best of the paper's network, and the paper's own
-(section 2.3)."""
+"""Training runs by name: our best, the best with the paper's network, and the paper's own (section
+2.3)."""

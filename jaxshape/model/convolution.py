@@ -1,9 +1,9 @@
 """The two 5x5x5, stride-2 convolutions of the auto-encoder, as matrix products on CPU.
 
-`downsample` halves a grid and `upsample` doubles it; each is the adjoint of the other, which is
-all that is needed to differentiate them. XLA's CPU backend runs the same operations up to 300
-times slower than the hardware allows, so there they are written as matrix products, a few
-examples at a time so that temporaries stay in cache:
+`downsample` halves a grid and `upsample` doubles it; each is the adjoint of the other, which
+suffices to differentiate both. XLA's CPU backend runs the same operations up to 300 times slower
+than the hardware allows, so there they are written as matrix products, a few examples at a time so
+that temporaries stay in cache:
 
 - Grids of 8 or more coarse voxels a side go through fast convolution (`tiles`). That is
   linear in the grid and in the kernel, so its transposes are the other direction and the gradient.
@@ -187,7 +187,7 @@ def _tiled(coarse_shape, kernel_shape) -> bool:
 
 
 def _in_cache(values: int) -> int:
-    """Number of examples whose gathered values, so many each, fit into the cache together."""
+    """Number of examples whose gathered values fit into the cache together."""
     return max(1, CACHE_BYTES // (4 * values))
 
 
@@ -254,7 +254,7 @@ def _z_matrix(kernel: Float[Array, "5 fine coarse"]) -> Float[Array, "3*coarse 2
 def _multiply_then_shift(
     coarse: Float[Array, "b x y z coarse"], kernel: Float[Array, "5 5 5 1 coarse"]
 ) -> Float[Array, "b 2*x 2*y 2*z 1"]:
-    """One product with all 125 taps, then an axis at a time the shifts, which move few values.
+    """One product with all 125 taps, then the shifts, one axis at a time; they move few values.
 
     Voxels come last in the product, so that shifting them is cheap.
     """

@@ -1,8 +1,8 @@
-"""Which way meshes stand and look: what a prior predicts of them, and how they stand. [host]
+"""The orientation of meshes, from a prior's predictions and from how stably they stand. [host]
 
 A prior knows its objects upright and from their front. Half of a surface is hidden from it, four
-times: back, front, top and bottom. It predicts what is hidden best where the mesh is turned as
-those it was trained on. How seats stand (`jaxshape.data.orientation`) has a say in which way is up.
+times: back, front, top and bottom. It predicts the hidden part best where the mesh is oriented like
+    the training meshes. How seats stand (`jaxshape.data.orientation`) has a say in which way is up.
 Of 13 real seats turned at random to one of 24 orientations, 12 were turned back so.
 """
 
@@ -26,7 +26,7 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.model.shapes import ShapePrior, decode, encode
 
 STANCE = 0.1
-"""Weight of how a seat stands, beside nats per voxel of what the prior predicts."""
+"""Weight of a seat's stance, relative to nats per voxel of the prior's prediction."""
 
 CLEAR = 0.02
 """By how much axes must score better than others: of 25 real seats that look along +z, one scored
@@ -47,7 +47,8 @@ def facing_scores(
     Args:
         prior: The shape prior.
         mesh: The mesh, its box centred at the origin.
-        ups: Axes to try as up; None for all that the stance of a seat does not rule out.
+        ups: Axes to try as up; None for all orientations that the stance of a seat does not rule
+            out.
 
     Returns:
         For each pair of axes `(up, front)` nats per hidden voxel, with the stance added.

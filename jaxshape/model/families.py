@@ -1,4 +1,4 @@
-"""What training needs to know of a network: how it starts, and what a batch costs it."""
+"""The parts of a network that training needs: its initial parameters and the loss of a batch."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -52,8 +52,8 @@ class Family(NamedTuple):
 
     Attributes:
         model: Its shape model.
-        initialize: `(key, architecture) -> variables`, a dictionary with `params` and what else the
-            network keeps.
+        initialize: `(key, architecture) -> variables`, a dictionary with `params` and the network's
+            other state.
         cost: `(variables, batch, noise, config, axis) -> Cost`, where `noise` holds standard normal
             numbers for each code `[b d]`, and `axis` is the mesh axis over which the batch is
             spread.
@@ -91,7 +91,7 @@ def cross_entropy(
 
 
 def autoencoder_cost(variables, batch: Batch, noise, config: TrainConfig, axis) -> Cost:
-    """Cross-entropy of the decoded code of F, and what the code's length costs."""
+    """Cross-entropy of the decoded code of F, and the penalty on the code's length."""
     dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32
     assert isinstance(config.architecture, Architecture)
     network = autoencoder.AutoEncoder(config.architecture, dtype, axis)
@@ -122,8 +122,8 @@ AUTOENCODERS = Family(
 def completion_cost(variables, batch: Batch, noise, config: TrainConfig, axis) -> Cost:
     """The evidence bound of a conditional variational auto-encoder.
 
-    Some examples decode the first code, 0, which must be the best answer without a search; the
-    others a code of the posterior, whose divergence from the normal distribution they pay.
+    Some examples decode the first code, 0, which must be the best answer without a search. The
+    others decode a sample of the posterior and pay its divergence from the normal distribution.
     """
     del axis  # no statistics over the batch
     dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32

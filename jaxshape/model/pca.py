@@ -2,8 +2,8 @@
 
 A shape is the mean grid plus `d` components, `p = mean + code @ components`, and its logits are
 `slope (p - 1/2)`. The first code is the most probable one given the voxels that were measured: the
-codes of the training set are normal with the variances of their components, and what a voxel shows
-differs from `p` by independent noise.
+codes of the training set are normal with the variances of their components, and each voxel differs
+from `p` by independent noise.
 """
 
 import jax

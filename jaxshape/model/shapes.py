@@ -1,11 +1,11 @@
 """The seam of every shape space: a model is three pure functions over a pytree of parameters.
 
     first code = encode(params, grids)            F and M to a code, once per object
-    prepared   = prepare(params, grids, precision)  all that does not depend on the code, once
-    logits     = decode(prepared, codes)            thousands of times
+    prepared = prepare(params, grids, precision) everything independent of the code, once logits
+    = decode(prepared, codes)            thousands of times
 
-Everything outside `jaxshape.model` reaches a network through the `ShapeModel` that a `ShapePrior`
-carries beside its parameters. `autoencoder` and `pca` are members; docs/examples has one of yours.
+Code outside `jaxshape.model` reaches a network through the `ShapeModel` that a `ShapePrior` carries
+with its parameters. `autoencoder` and `pca` are members; docs/examples has one of yours.
 """
 
 from collections.abc import Callable
@@ -60,13 +60,13 @@ class ShapeModel:
         decode: `(prepared, codes [n d]) -> logits [n x y z]`, occupied where positive.
             Differentiable in the codes.
         prepare: `(params, grids [b ...] | None, precision) -> Prepared`, called once per search.
-            `precision` is that of the decoder's matrix products. A model that decodes from the code
-            alone ignores the grids, and works without any.
+            `precision` is the precision of the decoder's matrix products. A model that decodes from
+            the code alone ignores the grids, and works without any.
         shapes: `params -> ` the same tree of `jax.ShapeDtypeStruct`, for a model of the sizes that
             the parameters seem to have; loading compares weights files with it. None compares only
             the results of `encode` and `decode`.
-        conditional: Whether `prepare` needs the grids: the decoder takes what was measured, so that
-            its first code answers for it already.
+        conditional: Whether `prepare` needs the grids: the decoder takes the measurement, so that
+            its first code accounts for it already.
     """
 
     kind: str
@@ -155,8 +155,8 @@ def decode(
         prior: The shape prior.
         code: Codes with any leading axes `[*batch d]`, decoded by one call in bounded memory.
         grids: F and M of the objects `[b x y z]`, for models whose decoder takes the measurement;
-            the first axis of `code` is then that of the objects. None for models that decode from
-            the code alone.
+            the first axis of `code` is then the objects. None for models that decode from the code
+            alone.
 
     Returns:
         Logits of each code `[*batch x y z]`.

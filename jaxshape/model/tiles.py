@@ -62,7 +62,7 @@ def transform_kernel(
 
 
 def _along(matrix: Float[np.ndarray, "*new 5"], kernel: Array, axis: int) -> Array:
-    """A small constant matrix times one axis of a kernel, whose new axes come first.
+    """A small constant matrix times one axis of a kernel; the new axes come first.
 
     Written out: arrays that a program holds as constants cannot be batched with it.
     """

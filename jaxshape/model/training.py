@@ -45,7 +45,7 @@ class TrainState(NamedTuple):
 
     Attributes:
         step: Steps taken so far.
-        variables: Parameters under `params`, and what else the network keeps.
+        variables: Parameters under `params`, and the network's other state.
         optimizer: State of the optimiser.
         average: Running average of the parameters; empty where none is kept.
     """
@@ -65,7 +65,7 @@ class Report(NamedTuple):
         iou: IoU of the completed training grids, at threshold 0.5, from 0 to 1.
         validation_iou: IoU of the decoded first codes of objects kept out of training; None where
             none are.
-        validation_occluded: The same in occluded voxels alone.
+        validation_occluded: The same metric in occluded voxels alone.
         samples_per_second: Pairs per second.
         seconds: Time spent on these steps.
     """
@@ -144,7 +144,7 @@ def train_step(
     """One step of the optimiser on a batch.
 
     Where the batch is spread over devices, each holds its part, and statistics, gradients and
-    figures are those of the whole.
+    figures cover the whole batch.
 
     Args:
         state: State before the step.
@@ -190,7 +190,7 @@ def batch_of(
     """The training pairs of one step; a function of the seed and the step.
 
     Objects come in a new order each epoch, and each pair has random numbers of its own, so that
-    `part` i of n of a batch is what it would be in the whole.
+    `part` i of n of a batch equals its rows of the whole batch.
     """
     count, (index, parts) = len(dataset.names) - validation_size(dataset, config), part
     size = config.batch // parts
@@ -348,7 +348,7 @@ def finished_prior(
 
     Args:
         folder: Folder of the run.
-        dataset: Its training pairs.
+        dataset: The training pairs.
         config: Settings of the run.
         samples: Codes from which the statistics are computed, at most.
     """
@@ -390,7 +390,7 @@ def _agreed_state(
 ) -> TrainState:
     """The state of the checkpoint, or the initial one where there is none, for all processes.
 
-    The first looks, for the others may not see its disk; they refuse what it refuses.
+    The first process looks, since the others may not see its disk; all refuse together.
     """
     share, is_first = multihost_utils.broadcast_one_to_all, jax.process_index() == 0
     path = folder / "checkpoint.safetensors"

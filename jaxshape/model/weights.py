@@ -26,10 +26,10 @@ from jaxshape.model.shapes import ShapeModel, ShapePrior, resolution_of
 FORMAT = "jaxshape-shape-prior-1"
 
 FORMAT_IN_BYTES = "jaxshape-shape-prior-2"
-"""Arrays of 8 bits have factors beside them: one for each channel of their last axis."""
+"""Each array of 8 bits has an array of factors: one for each channel of its last axis."""
 
 FACTORS = "factors/"
-"""What the names of these factors begin with."""
+"""Prefix of the names of these factors."""
 
 BYTE_STEPS = 127
 """Steps of 8 bits from 0 to the largest weight of a channel."""
@@ -41,12 +41,13 @@ MODELS = {model.kind: model for model in (AUTOENCODER, COMPLETION, PCA)}
 """The kinds of shape models that come with the package."""
 
 PACKAGED = ("chair", "chair-autoencoder")
-"""Weights that come with the package: of the network that is conditioned on what was measured, and
-of the paper's auto-encoder."""
+"""Weights that come with the package: of the network that is conditioned on the measurement, and of
+the paper's auto-encoder."""
 
 
 def packaged_for(family: str) -> str:
-    """The package's weights for a family of objects: its own, those of chairs where it has none."""
+    """The package's weights for a family of objects; the chairs' where the family has none of its
+    own."""
     return family if family in PACKAGED else "chair"
 
 
@@ -112,8 +113,8 @@ def load_prior(
         model: Your own model, for weights of its kind; None for weights of the package's models.
 
     Raises:
-        WeightsError: The file is missing, damaged, not in this format, or of a kind of model that
-            is not known; or its arrays are not finite, or not those of its model.
+        WeightsError: The file is missing, damaged, not in this format, or of an unknown kind of
+            model; or its arrays are not finite, or do not fit its model.
     """
     where = _path(path)
     tensors, metadata = _read(where)
@@ -143,7 +144,7 @@ def _calibration(numbers: np.ndarray | None, path: Path) -> Calibration | None:
 
 
 def _weights(tensors: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
-    """The weights in single precision, those in bytes times their factors."""
+    """The weights in single precision; arrays of bytes are multiplied by their factors."""
     found = {}
     for name, x in tensors.items():
         if not name.startswith(FACTORS):

@@ -13,7 +13,7 @@ def apply_if(due: Bool[Array, ""], function: Callable[..., Any], *operands: PyTr
 
     A plain `lax.cond` turns into a select under `jax.vmap` and would do the work for every element
     every time. Here a batch does it when ANY element is due, and keeps it where that element is.
-    `function` returns what it was given, with the same shapes, and closes over constants only.
+    `function` returns arrays of the same shapes as its operands, and closes over constants only.
     """
 
     @jax.custom_batching.custom_vmap
@@ -38,7 +38,7 @@ def apply_if(due: Bool[Array, ""], function: Callable[..., Any], *operands: PyTr
 
 
 def select(wanted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
-    """`new` where wanted, else `old`; for trees of the same shapes."""
+    """`new` where wanted, otherwise `old`; for trees of the same shapes."""
     return jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, old)
 
 

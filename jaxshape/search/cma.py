@@ -1,7 +1,7 @@
 """CMA-ES: covariance matrix adaptation, with the semantics of pycma.
 
 Equations and symbols follow Hansen, "The CMA Evolution Strategy: A Tutorial" (arXiv:1604.00772);
-constants are those of pycma 4.5, the package the paper used, which adds a step-size damping for
+the constants come from pycma 4.5, the package the paper used, which adds a step-size damping for
 large populations. `cma_ask` and `cma_tell` are the algorithm, `rates.py` has its constants,
 `stopping.py` says when it is over, `methods/cma.py` binds them to a `Refiner`, and `restarts.py`
 starts it again with larger populations.
@@ -45,7 +45,7 @@ class CmaState(NamedTuple):
         path_sigma: p_sigma `[d]`, the evolution path of the step size.
         path_c: p_c `[d]`, the evolution path of the covariance.
         generation: Generations that the distribution has seen, from 0.
-        history: What the stop criteria remember of earlier generations.
+        history: Earlier generations, as far as the stop criteria need them.
     """
 
     mean: Float[Array, " d"]
@@ -279,7 +279,7 @@ def _sphere(state: CmaState, steps: Float[Array, "*n d"]) -> Float[Array, "*n d"
 
 
 def _balanced(state: CmaState) -> CmaState:
-    """The same distribution, its scale moved from C into sigma before C under- or overflows.
+    """The same distribution, with its scale moved from C into sigma before C under- or overflows.
 
     A run without stopping can go that far: large populations shrink C instead of sigma.
     """

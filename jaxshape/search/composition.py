@@ -1,4 +1,4 @@
-"""The composed shape: what was measured, and what fills the rest (paper, section 2.4)."""
+"""The composed shape: measured voxels, and a decoded shape in the others (paper, section 2.4)."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.geometry.symmetry import NATS, mirrored, symmetrised
 
 LEARNT_NATS = 1.0
-"""What a seen mirror image adds where the decoder has taken it into account already."""
+"""Nats that a measured mirror image adds where the decoder has taken it into account already."""
 
 
 class Composition(NamedTuple):
-    """A composed shape, and what fills it; leading axes are batch axes.
+    """A composed shape and its parts; leading axes are batch axes.
 
     Attributes:
-        composed: What was measured where something was, the filling elsewhere `[*batch x y z]`.
+        composed: Measured voxels as measured, occluded voxels from the filling `[*batch x y z]`.
         logits: Logits of the filling `[*batch x y z]`.
         symmetric: Whether the filling is mirrored `[*batch]`; None where that was not asked for.
         agreement: Share of the surface measured on both sides that agrees, 0 to 1 `[*batch]`; None
@@ -38,13 +38,13 @@ def complete(
     symmetry: bool,
     conditional: bool = False,
 ) -> Composition:
-    """Fill what was not measured with a decoded shape, and with the mirror image of what was.
+    """Fill unmeasured voxels with a decoded shape and with the mirror image of measured ones.
 
     Args:
         grids: F and M of the objects `[*batch x y z]`, binary or soft.
         logits: Logits of their decoded shapes `[*batch x y z]`.
-        symmetry: Average each decoded shape with its mirror image, and add what the other side
-            showed, where the measured halves agree.
+        symmetry: Average each decoded shape with its mirror image, and add the evidence of the
+            other side, where the measured halves agree.
         conditional: The decoder took the measurement (`ShapeModel.conditional`). Its answer then
             counts where something was measured, too, and is mirrored in occluded voxels alone.
     """
@@ -64,7 +64,7 @@ def complete(
 def agreed(
     occupied: Grid, occluded: Grid, probability: Float[Array, "*batch x y z"]
 ) -> Bool[Array, "*batch x y z"]:
-    """What measurement and a decoder that knew of it say together.
+    """Combine the measurement with a decoder that was conditioned on it.
 
     Points of a coarse camera make its rays pass through thin parts: of binary grids surface is kept
     as it was measured, and free space is left to the decoder. Soft grids say how sure they are of
@@ -82,7 +82,7 @@ def agreed(
 
 
 def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*batch x y z"]:
-    """Keep what was observed as measured; fill what was occluded with the completed shape.
+    """Keep observed voxels as measured; fill occluded ones with the completed shape.
 
     Args:
         occupied: F `[*batch x y z]`, binary or soft.

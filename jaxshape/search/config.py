@@ -51,17 +51,17 @@ class RefineConfig:
             mean code in the whitened space and 0 in the raw one. Above 0, in units of the search
             space; None for no bounds.
         prior_weight: Weight of the codes' prior density, 0 or more: 1 adds the negative log-density
-            of the training codes to that of the voxels.
+            of the code, under the training codes, to the objective.
         tolerance: The search stops where the objectives of recent candidates differ by less than
             this, 0 or more, in nats per voxel; 0 never stops it.
         target: The search stops where the objective is this low, in nats per voxel; None for no
-            such target.
+            target.
         precision: Precision of the decoder's matrix products during the search, `float32` or
             `bfloat16`.
-        symmetry: Fill what is hidden on one side of an object with what its mirror image shows,
-            where the measured halves agree (not in the paper). The search itself is the same.
-        samples: Shapes to draw from the posterior of each object once its search has ended, 0 or
-            more; they say how sure each voxel is. 1 would say nothing.
+        symmetry: Fill the hidden part of one side of an object from its mirror image, where the
+            measured halves agree (not in the paper). The search itself is the same.
+        samples: Shapes to draw from the posterior of each object after its search, 0 or more; they
+            give the uncertainty of each voxel. A single one gives none.
 
     Raises:
         ValueError: A setting is outside its range.

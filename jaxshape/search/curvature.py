@@ -1,9 +1,9 @@
 """The objective about a point to second order, in the directions in which it curves most.
 
 The Gauss-Newton matrix of an objective l(f(u)), J^T H J with J the Jacobian of f and H the Hessian
-of l, is positive semi-definite where l is convex. It is never written out: k products with it give
-the Lanczos directions Q, which span the gradient and what the matrix makes of it, and the matrix
-among them, T = Q^T (J^T H J) Q. A product takes about the time of a gradient.
+of l, is positive semi-definite where l is convex. It is never formed: k products with it give the
+Lanczos directions Q, which span the Krylov space of the gradient, and the matrix in that space, T =
+Q^T (J^T H J) Q. A product takes about the time of a gradient.
 
 A search asks for it by `expand`. Objectives of `refine` and `js.objective` are `Composed`; of a
 plain function of JAX the Hessian takes the place of the Gauss-Newton matrix.
@@ -42,7 +42,7 @@ class Expansion(NamedTuple):
 
 @dataclass(frozen=True)
 class Composed:
-    """An objective that knows what it is composed of, so that it has a Gauss-Newton matrix.
+    """An objective that exposes its inner and outer function, so that it has a Gauss-Newton matrix.
 
     Attributes:
         loss: `point [d] -> loss`; calling the objective calls it.
@@ -81,8 +81,8 @@ def expand(objective: Objective, point: Float[Array, " d"], directions: int) -> 
     Args:
         objective: The loss of one point: `Composed`, or any function that JAX can differentiate
             twice, whose Hessian may have negative curvature.
-        point: The point `[d]`. One that is not finite costs a `Composed` objective nothing.
-        directions: Directions at most, 1 or more; d of them give the whole matrix.
+        point: The point `[d]`. A loss that is not finite costs a `Composed` objective nothing.
+        directions: Largest number of directions, 1 or more; d of them give the whole matrix.
 
     Returns:
         The expansion, with min(directions, d) directions.
@@ -103,8 +103,8 @@ def lanczos(
 ) -> tuple[Float[Array, "n k d"], Float[Array, "n k k"]]:
     """Orthonormal directions of the Krylov spaces of n symmetric matrices, and these among them.
 
-    Each direction is what a matrix makes of the one before, orthogonal to all earlier ones. That is
-    done twice, since rounding undoes it once.
+    Each direction is the matrix times the previous one, made orthogonal to all earlier ones. The
+    orthogonalisation is done twice, because of rounding.
 
     Args:
         product: n symmetric matrices times a vector each.

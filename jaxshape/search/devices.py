@@ -38,8 +38,8 @@ def over_devices(
         function: Pure; returns a tree of arrays with the same leading axis as the rows.
         shared: Tree of arrays, or of numbers, that all rows share.
         rows: Tree of arrays with an axis over objects first.
-        devices: Devices to use, the first of those of this process, 1 or more; None for all, or
-            for the one on which you have put an array. In a mesh of yours, it says nothing.
+        devices: Number of this process's devices to use, 1 or more; None for all, or for the one on
+            which you have put an array. In a mesh of yours, it says nothing.
 
     Raises:
         ValueError: `devices` is not a whole number, or is below 1.
@@ -60,7 +60,7 @@ def over_devices(
 def numbers(count: int) -> Int[Array, " object"]:
     """Numbers of the objects of this device in the whole batch.
 
-    Copies that fill up the last device have the numbers behind those of the batch.
+    Copies that pad the last device are numbered after the objects of the batch.
 
     Args:
         count: Objects of this device.
@@ -84,7 +84,7 @@ def _mesh_of(rows: PyTree) -> tuple[AbstractMesh, tuple[str, ...]]:
 
 
 def _is_committed(x: Any) -> bool:
-    """Whether its user has put an array on one device; that of a traced one is not known."""
+    """Whether the caller has put an array on one device; unknown for a traced array."""
     is_known = isinstance(x, jax.Array) and not isinstance(x, Tracer)
     return is_known and x.committed and len(x.devices()) == 1
 

@@ -47,7 +47,7 @@ def export_reconstruct(
         config: Settings of the search.
         objects: Objects that are searched together, 1 or more.
         soft: Whether F and M are soft, as signed distances give them, or binary.
-        platforms: Where the program can run, by JAX's names.
+        platforms: Platforms on which the program can run, by JAX's names.
 
     Returns:
         The content of a file.
@@ -83,8 +83,8 @@ def load_reconstruct(content: bytes) -> Callable[..., Reconstruction]:
         content: The content of the file.
 
     Returns:
-        `run(key, prior, occupied [object x y z], occluded [object x y z])`, which returns what
-        `reconstruct` does for any number of objects.
+        `run(key, prior, occupied [object x y z], occluded [object x y z])`, which returns the
+        result of `reconstruct` for any number of objects.
 
     Raises:
         ModuleNotFoundError: flatbuffers is not installed.

@@ -24,7 +24,7 @@ Build = Callable[..., Any]
 
 
 def families() -> list[str]:
-    """The families of searches: those of this package, and those that installed ones offer."""
+    """The families of searches of this package and of installed packages."""
     return sorted({*_own(), *_offered()})
 
 
@@ -38,7 +38,7 @@ def find_build(name: str) -> tuple[Build, str | None]:
         The function, and the variant or None.
 
     Raises:
-        ValueError: There is no such search, or what the name points to cannot be imported.
+        ValueError: The search is unknown, or the module in its name cannot be imported.
     """
     family, _, variant = name.partition(":")
     if family in _own():
@@ -72,7 +72,7 @@ def _imported(name: str, module: str, function: str) -> Build:
     """A function by its import path."""
     try:
         found = getattr(importlib.import_module(module), function, None)
-    except Exception as error:  # whatever a module raises while it is imported
+    except Exception as error:  # a module may raise anything while it is imported
         raise ValueError(
             f"The method {name!r} cannot be imported: {type(error).__name__}: {error}."
         ) from error

@@ -16,12 +16,12 @@ from jaxshape.search.residuals import BALANCED, Residual
 from jaxshape.search.rows import hoisted, loss_over_rows, of_one_row, one_network, over_rows
 from jaxshape.search.space import LatentSpace, raw
 
-# What a code costs besides its residual, in nats per voxel.
+# The penalty of a code, in nats per voxel.
 Penalty = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 
 class Own(NamedTuple):
-    """What the objective of one object has of its own; leading axes are batch axes.
+    """The part of the objective that differs between objects; leading axes are batch axes.
 
     Attributes:
         features: Features of its measurement, as the model prepared them.
@@ -64,11 +64,11 @@ def evaluation(
 
     Args:
         model: The shape model.
-        prepared: Its parameters; only the shared ones are used.
+        prepared: Prepared parameters; only the shared ones are used.
         residual: The residual that scores logits.
         penalty: `code -> ` nats per voxel to add; None for no penalty.
         code: A code `[d]`, as an example of its shape.
-        own: What an object has of its own, as an example of its shapes.
+        own: Part of the objective that differs between objects, as an example of its shapes.
     """
 
     def price(code, logits, target, weight):
@@ -123,7 +123,7 @@ def composed(how: Evaluation, space: LatentSpace, own: Own) -> Composed:
     Args:
         how: The scoring of codes.
         space: Coordinates of the search.
-        own: What the object has of its own.
+        own: Part of the objective that belongs to this object.
     """
 
     def expansion(point, directions):

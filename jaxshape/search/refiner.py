@@ -106,10 +106,10 @@ class Trace(NamedTuple):
 class Refiner(NamedTuple):
     """A search over one point; batch it with `jax.vmap`.
 
-    Every state has `best` (a `Candidate`), `mean` and `stop`. `mean` is where the search stands:
-    the centre of the distribution it samples, or the current iterate of a gradient method, whose
-    loss may not have been evaluated. `stop` is a `StopReason`; a search without criteria of its
-    own leaves it at RUNNING. Numbers have the type of the point, counters are int32.
+    Every state has `best` (a `Candidate`), `mean` and `stop`. `mean` is the centre of the
+    distribution that the search samples, or the current iterate of a gradient method, whose loss
+    may not have been evaluated. `stop` is a `StopReason`; a search without criteria of its own
+    leaves it at RUNNING. Numbers have the type of the point, counters are int32.
 
     An objective is called under `jax.vmap` or `jax.grad`; those of `refine` have a Gauss-Newton
     matrix, too (`jaxshape.search.curvature.expand`).
@@ -208,7 +208,7 @@ def summarise(
     """The trace of one iteration.
 
     Args:
-        best: The best candidate so far, those of this iteration included.
+        best: The best candidate so far, including this iteration.
         points: Candidates of this iteration `[n d]`.
         losses: Losses of these candidates `[n]`.
         evaluations: Evaluations of the objective so far, the start included.

@@ -1,4 +1,4 @@
-"""What a search minimises: the disagreement of a decoded shape with what was measured.
+"""The objective of a search: the disagreement of a decoded shape with the measurement.
 
 A `Residual` is two pure functions of ONE object and ONE candidate; the search batches them.
 
@@ -30,9 +30,9 @@ class Residual(NamedTuple):
     measurement is. `RefineConfig.objective` names them `paper`, `balanced` and `soft`.
 
     Attributes:
-        target: `(grids, first_logits [x y z]) -> target`: a pytree of arrays, worked out once from
-            what was measured of an object and from its decoded first code, G(lambda_0).
-            `grids.data` holds what you gave to `reconstruct` besides F and M.
+        target: `(grids, first_logits [x y z]) -> target`: a pytree of arrays, computed once from
+            the measurement of an object and its decoded first code, G(lambda_0). `grids.data` holds
+            the further arrays that you gave to `reconstruct`.
         score: `(logits [x y z], target) -> loss`, a scalar in nats per voxel, differentiable in
             the logits.
     """
@@ -50,8 +50,8 @@ class Weights(NamedTuple):
         prior: Factor of alpha, the weight of the prior where nothing was measured, 0 or more (Eq.
             7: 1).
         least_alpha: Lower bound of alpha, 0 or more (Eq. 7: 0). After many frames little is
-            occluded and alpha is small: the search then gives the hidden part up to fit the noise
-            of what was measured.
+            occluded and alpha is small: the search then sacrifices the hidden part to fit the noise
+            of the measurement.
     """
 
     free: float = 1.0
@@ -83,7 +83,7 @@ def weigh(
     Args:
         grids: F and M, binary or soft, `[*batch x y z]`.
         first_logits: Logits of the decoded first code, G(lambda_0), `[*batch x y z]`.
-        weights: Weights of measured free space and of the prior; those of Eq. 7 by default.
+        weights: Weights of measured free space and of the prior; Eq. 7's by default.
 
     Returns:
         The target of `cross_entropy`. alpha is sum(M) / sum(1 - M), at least `weights.least_alpha`,
@@ -119,7 +119,7 @@ def cross_entropy(logits: Float[Array, "*batch x y z"], target: Target) -> Float
     """
     # -log sigmoid(l) = softplus(-l) = softplus(l) - l, and -log(1 - sigmoid(l)) = softplus(l).
     softplus = jnp.maximum(logits, 0) + jnp.log(1 + jnp.exp(-jnp.abs(logits)))
-    # Sums written as products run several times faster on CPU than what XLA fuses into a mean.
+    # Sums written as products run several times faster on CPU than XLA's fused mean.
     over_voxels = partial(jnp.einsum, "...xyz,...xyz->...", precision="highest")
     total = over_voxels(target.occupied + target.empty, softplus)
     return (total - over_voxels(target.occupied, logits)) / math.prod(logits.shape[-3:])
@@ -129,7 +129,7 @@ def equation_7(weights: Weights = AS_PRINTED) -> Residual:
     """Eq. 7 of the paper, on binary F and M: soft grids are rounded.
 
     Args:
-        weights: Weights of free space and of the prior; those of Eq. 7 by default.
+        weights: Weights of measured free space and of the prior; Eq. 7's by default.
     """
     return Residual(lambda grids, logits: weigh(binary(grids), logits, weights), cross_entropy)
 
@@ -138,12 +138,12 @@ def soft(weights: Weights = UNDER_NOISE) -> Residual:
     """Eq. 7 with each voxel weighted by how sure its measurement is.
 
     F and M are probabilities, as fused signed distances give them (`jaxshape.geometry.evidence`).
-    A voxel that is known by half pulls half as strongly towards what was measured there, and half
-    towards the prior.
+    A voxel that is known with probability 0.5 pulls half as strongly towards its measured value,
+    and half towards the prior.
 
     Args:
-        weights: Weights of free space and of the prior; by default those of `BALANCED` with alpha
-            at least 0.8.
+        weights: Weights of measured free space and of the prior; by default as in `BALANCED`, with
+            alpha at least 0.8.
     """
     return Residual(lambda grids, logits: weigh(grids, logits, weights), cross_entropy)
 

@@ -1,8 +1,9 @@
 """CMA-ES that starts again with a larger population when it stops: IPOP and BIPOP.
 
-All inside the compiled loop, where shapes are fixed: every iteration evaluates the same number of
-candidates, and a population m times as large collects those of m iterations before the
-distribution moves. Each object of a batch restarts on its own, and no evaluation is wasted.
+Everything happens inside the compiled loop, where shapes are fixed: every iteration evaluates the
+same number of candidates, and a population m times as large collects the candidates of m iterations
+before the distribution moves. Each object of a batch restarts on its own, and no evaluation is
+wasted.
 
 IPOP doubles the population at each restart (Auger and Hansen, "A restart CMA evolution strategy
 with increasing population size", 2005). BIPOP spends an equal share of the evaluations on short
@@ -54,7 +55,7 @@ class Run(NamedTuple):
 
 
 class RestartState(NamedTuple):
-    """The run that is under way, the generation it collects, and what came before.
+    """The current run, the generation that it collects, and the best of earlier runs.
 
     Attributes:
         mean: Centre of the present distribution `[d]`.
@@ -97,7 +98,8 @@ def with_restarts(
     restart_point: Callable[[Array, Float[Array, " d"]], Float[Array, " d"]] | None = None,
     tolerances: Tolerances = Tolerances(),
 ) -> Refiner:
-    """CMA-ES with restarts; the same number of candidates per iteration, whatever the population.
+    """CMA-ES with restarts; the number of candidates per iteration stays the same for every
+    population.
 
     Args:
         kind: "ipop", which doubles the population at each restart, or "bipop", which spends as many
@@ -106,8 +108,8 @@ def with_restarts(
         sigma0: First standard deviation, above 0, in units of the search space.
         population: Candidates per iteration and population of the first run, 3 or more; None for
             pycma's 4 + floor(3 ln dim).
-        doublings: Doublings of the population, 0 or more. A run after the last of them ends the
-            search when it stops.
+        doublings: Doublings of the population, 0 or more. The search ends when the run after the
+            last restart stops.
         restart_point: `(key, first point [d]) -> point [d]`, the mean of a new run; None begins
             every run at the first point.
         tolerances: Stop criteria that end a run.
@@ -203,7 +205,7 @@ def with_restarts(
         unknown = jnp.full_like(state.best.loss, jnp.inf)
         return state._replace(
             search=cma.start(point, run.sigma0, dim, size, unknown),
-            losses=jnp.full_like(state.losses, jnp.inf),  # those of a larger population
+            losses=jnp.full_like(state.losses, jnp.inf),  # settings of a larger population
             mean=point,
             run=run,
             large_runs=large_runs,

@@ -6,7 +6,8 @@ number at a time. Nothing here knows networks or residuals: a score is a functio
 
     score(shared, codes [n d], own [n ...]) -> pytree of [n ...]
 
-of constants that all rows share, of one code for each row, and of what belongs to the row's object.
+of constants that all rows share, of one code for each row, and of arrays that belong to the row's
+object.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +27,8 @@ from jaxshape.model.shapes import pick
 Score = Callable[[PyTree, Float[Array, "n d"], PyTree], PyTree]
 
 ROWS_AT_A_TIME = {"cpu": 8, "default": 1024}
-"""Rows scored together: on CPU enough for the matrix products of a decoder, else a full device."""
+"""Rows scored together: on CPU enough for the matrix products of a decoder, otherwise a full
+device."""
 
 
 def loss_over_rows(
@@ -69,8 +71,9 @@ def over_rows(score: Score, at_a_time: Mapping[str, int] = ROWS_AT_A_TIME) -> Ca
         at_a_time: Rows that are scored together, by platform.
 
     Returns:
-        `scored(shared, codes [n d], own [m ...], owner [n])`, where `owner` is the index of what
-        belongs to each row. `shared` must be the same in every element of a batch (`one_network`).
+        `scored(shared, codes [n d], own [m ...], owner [n])`, where `owner` is the index of each
+        row's object in `own`. `shared` must be the same in every element of a batch
+        (`one_network`).
     """
 
     @custom_vmap
@@ -117,7 +120,7 @@ def of_one_row(
         score: Scores rows.
         shared: Constants that all rows share.
         code: The code `[d]`.
-        own: What belongs to its object.
+        own: Arrays that belong to its object.
         at_a_time: Rows that are scored together, by platform.
     """
     rows = jax.tree.map(lambda x: x[None], own)
@@ -128,7 +131,7 @@ def of_one_row(
 def _by_chunks(score: Score, size: int, shared, codes, own, owner) -> PyTree:
     """Score the rows `size` at a time; a chunk without a finite code is passed over.
 
-    Rows whose code is not finite score NaN in any company.
+    Rows whose code is not finite score NaN; they do not affect the other rows.
     """
 
     def chunk(rows, wanted):
@@ -149,7 +152,7 @@ def _by_chunks(score: Score, size: int, shared, codes, own, owner) -> PyTree:
 def one_network(shared: PyTree) -> PyTree:
     """The constants of a search, of which a batch has one for all: the identity.
 
-    They are the network, and what a residual and a penalty close over.
+    The constants are the network, and the arrays that a residual and a penalty close over.
 
     Raises:
         ValueError: `jax.vmap` batches them. A search over several networks is `jax.lax.map`.
@@ -172,11 +175,11 @@ def _refuse_networks(size: int, batched: PyTree, shared: PyTree) -> tuple[PyTree
 def hoisted(function: Callable[..., Array], *examples: Any) -> tuple[Callable[..., Array], Any]:
     """Make the arrays that a function closes over its first argument.
 
-    A closure cannot pass through `over_rows`, whose constants must be arguments.
+    A closure cannot pass through `over_rows`: its constants must be arguments.
 
     Args:
         function: Returns one array.
-        examples: Arguments like those that it will be called with.
+        examples: Arguments of the shapes and types of later calls.
 
     Returns:
         `pure(constants, *arguments)`, and the constants.

@@ -44,8 +44,8 @@ class Refined(NamedTuple):
         trace: Figures of each iteration `[object iteration ...]`; constant once the object's search
             has stopped.
         path: The best code so far, after each iteration `[object iteration d]`.
-        iterations: Iterations that the search took before it stopped `[object]`, those of
-            `previous` included.
+        iterations: Iterations before the search stopped `[object]`, including the iterations of
+            `previous`.
         stop: Why the search stopped `[object]`, as a `StopReason`.
         state: State of the refiner, one for each object; a later search can start from it
             (`warm_start`).
@@ -61,7 +61,7 @@ class Refined(NamedTuple):
     state: Any
 
 
-# What a callback is given after each iteration: numbers of the objects [n], how many iterations
+# The arguments of a callback after each iteration: numbers of the objects [n], the iterations that
 # each of them has taken [n], and its trace [n ...], as NumPy arrays.
 Callback = Callable[[np.ndarray, np.ndarray, Trace], None]
 
@@ -110,8 +110,7 @@ def refine(
         penalty_weight: Factor of the penalty, 0 or more.
         first_losses: Objectives of the first codes `[object]`, in nats per voxel; None where they
             are not known.
-        target_loss: Objective that is low enough to stop, in nats per voxel; None for no such
-            target.
+        target_loss: Objective that is low enough to stop, in nats per voxel; None for no target.
         previous: The outcome of an earlier call with the same arguments, but for `iterations` and
             `target_loss`: the search goes on as if it had not been interrupted. None begins.
         warm_start: States of an earlier search in the same space (`Refined.state`), whose targets
@@ -185,7 +184,8 @@ class _Begun(NamedTuple):
 
 
 def _begun(previous: Refined) -> _Begun:
-    """What a search needs to go on. One that had reached its target may be given a lower one."""
+    """The states from which a search goes on; a search that had reached its target may get a lower
+    one."""
     state, trace = previous.state, jax.tree.map(lambda x: x[:, -1], previous.trace)
     stop = jnp.where(state.stop == StopReason.TARGET, StopReason.RUNNING, state.stop)
     return _Begun(state._replace(stop=stop), trace, previous.iterations)
@@ -200,7 +200,7 @@ class _Rows(NamedTuple):
         targets: Targets of the residual.
         grids: F and M, or None.
         first_losses: Objectives of the first codes, or None.
-        begun: Where an interrupted search stood, or None.
+        begun: States of an interrupted search, or None.
         warm_start: States of a search for an earlier measurement, or None.
     """
 
@@ -220,7 +220,7 @@ class _Loop(NamedTuple):
         refiner: The search.
         how: The scoring of codes.
         space: Coordinates of the search.
-        own: What each object's objective has of its own.
+        own: Part of each object's objective that belongs to it alone.
         target_loss: Loss that is low enough to stop, or None.
         callback: Hears of every iteration, or None.
     """
@@ -270,7 +270,7 @@ class _Loop(NamedTuple):
         return self.refiner.resume(key, state, loss)
 
     def move(self, rows: _Rows, now: _Begun) -> _Begun:
-        """One iteration of all objects; those that have stopped stay as they are."""
+        """One iteration of all objects; stopped objects do not change."""
         running = now.state.stop == StopReason.RUNNING
 
         def move_one(key, state, own, trace):
@@ -354,7 +354,7 @@ def one_key_each(keys: Key[Array, "*object"], count: int) -> Key[Array, " object
 
 
 def _stop_at(target_loss: Float[Array, ""] | float | None, states: Any) -> Any:
-    """The states, with those stopped whose loss is low enough."""
+    """The states; objects whose loss has reached the target are stopped."""
     if target_loss is None:
         return states
     reached = states.best.loss <= target_loss

@@ -65,7 +65,7 @@ def whitened(prior: ShapePrior, bound: Float[Array, ""] | float | None = None) -
             box.
 
     Raises:
-        ValueError: The covariance of the codes is not positive semi-definite (told outside
+        ValueError: The covariance of the codes is not positive semi-definite (raised outside
             `jax.jit` only; inside, every loss of the search is NaN).
     """
     root = _root(prior.code_covariance)

@@ -25,7 +25,7 @@ RECORD_EVERY = 5
 class Tolerances:
     """Thresholds of the stop criteria of CMA-ES, by pycma's names, each 0 or more.
 
-    0 turns a criterion off, infinity those that are upper limits. A range or a length below its
+    0 turns a criterion off; infinity turns an upper limit off. A range or a length below its
     threshold ends the search.
 
     Attributes:
@@ -44,7 +44,7 @@ class Tolerances:
         noeffect: Whether to end where a step no longer changes the mean.
 
     Raises:
-        ValueError: A threshold is negative or no number. Those that JAX traces are not checked.
+        ValueError: A threshold is negative or no number. Traced values are not checked.
     """
 
     tolfun: Number = 1e-11
@@ -68,7 +68,7 @@ class Tolerances:
 
 
 class History(NamedTuple):
-    """What the stop criteria remember of a search; newest entries first.
+    """Earlier iterations, as far as the stop criteria need them; newest entries first.
 
     Attributes:
         tolstagnation: Generations without improvement that end a search; restarts keep the number
@@ -78,7 +78,7 @@ class History(NamedTuple):
         long_best: Best loss of every fifth generation `[long]`.
         long_median: Median loss of every fifth generation `[long]`.
         flat: Generations in a row whose losses were flat.
-        anchor: Where the mean was when it last moved `[d]`.
+        anchor: Mean after its last move `[d]`.
         anchored: The generation in which it last moved.
         lowest: Best loss of all generations.
         improved: The evaluation in which that loss was found, counted from 1.
@@ -143,7 +143,7 @@ def check(
         losses: Losses of the generation that `cma_tell` has just seen `[capacity]`.
         sigma0: First standard deviation of the search.
         population: Candidates of the generation. A traced population may be smaller than the number
-            of losses; those behind it do not count.
+            of losses; the losses after it do not count.
         tolerances: Thresholds of the criteria.
     """
     counts = jnp.arange(len(losses)) < population
@@ -209,7 +209,7 @@ def _criteria(
     population: int | Int[Array, ""],
     tolerances: Tolerances,
 ) -> dict[StopReason, Bool[Array, ""]]:
-    """Which criteria are met; where several are, the first one names the reason."""
+    """The criteria that are met; if several are, the first one names the reason."""
     t, mean, dim, now = tolerances, state.mean, len(state.mean), state.generation
     deviations = state.sigma * jnp.sqrt(jnp.diag(state.covariance))
 

@@ -24,8 +24,8 @@ def build_refiner(name: str, dim: int, config: RefineConfig) -> Refiner:
         The search.
 
     Raises:
-        ValueError: There is no such search, it refuses its settings, or the function cannot be
-            imported or returns something else.
+        ValueError: The search is unknown or refuses its settings, or the function cannot be
+            imported or does not return a search.
     """
     build, variant = find_build(name)
     refiner = build(variant, dim, config)

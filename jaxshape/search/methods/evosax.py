@@ -1,6 +1,6 @@
 """The distribution-based strategies of evosax, for comparison: `evosax:Sep_CMA_ES`, ...
 
-`evosax:Open_ES@18` has a population of its own, whatever the settings say.
+`evosax:Open_ES@18` sets the population in the name and overrides the settings.
 """
 
 from typing import Any, NamedTuple
@@ -26,8 +26,8 @@ from jaxshape.search.refiner import (
 )
 
 LEARNING_RATE = 0.3
-"""Learning rate of the strategies that follow an estimated gradient, in units of sigma0: Adam takes
-the place of their own optimisers, whose 0.001 to 0.01 hardly move."""
+"""Learning rate of the strategies that follow an estimated gradient, in units of sigma0: Adam
+replaces their own optimisers, whose rates of 0.001 to 0.01 hardly move the mean."""
 
 FOLLOW_A_GRADIENT = {
     "ARS",
@@ -74,8 +74,8 @@ class EvosaxState(NamedTuple):
 def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
     """The strategy that the variant names, `NAME` or `NAME@POPULATION`.
 
-    Without a population of its own it has that of the settings, or the next one up that it takes:
-    some want an even one.
+    A name without a population uses the one of the settings, or the next larger that the strategy
+    accepts: some need an even one.
     """
     name, at, number = (variant or "").partition("@")
     if not at:
@@ -97,9 +97,9 @@ def evosax_strategy(
 ) -> Refiner:
     """An evosax strategy by name: "Sep_CMA_ES", "SNES", "Open_ES" and their like.
 
-    The strategy searches u in point = first + sigma0 u from u = 0, so that `sigma0` is the
-    standard deviation of those that start at their default of 1, and the unit of every length and
-    learning rate. Losses that are not finite count as the worst finite one.
+    The strategy searches u in point = first + sigma0 u from u = 0, so that `sigma0` is the initial
+    standard deviation of strategies that start at their default of 1, and the unit of every length
+    and learning rate. Losses that are not finite count as the worst finite one.
 
     Args:
         name: Name of one of evosax's distribution-based strategies.
@@ -114,7 +114,7 @@ def evosax_strategy(
         The search.
 
     Raises:
-        ValueError: There is no such strategy, or it refuses the settings.
+        ValueError: The strategy is unknown, or it refuses the settings.
     """
     whole("dim", dim, 1)
     whole("population", population, 1)
@@ -191,7 +191,8 @@ def _defaults(name: str, dim: int) -> dict[str, Any]:
 
 
 def _worst_if_failed(losses: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Losses with those that are not finite set to the largest finite one, or all to 0."""
+    """Losses in which values that are not finite become the largest finite one; 0 if none is
+    finite."""
     finite = jnp.isfinite(losses)
     worst = jnp.max(losses, where=finite, initial=-jnp.inf)
     return jnp.where(finite, losses, jnp.where(jnp.any(finite), worst, 0))

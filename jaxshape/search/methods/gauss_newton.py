@@ -3,9 +3,9 @@
 The objective of a shape is nearly quadratic in the code: where its quadratic model about the best
 point is least, it is nearly as low as the model says. Each step goes to the minimum of the model,
 damped where the model has proved wrong, in the directions in which the objective curves most
-(`curvature.py`). `gauss-newton:20` takes 20 of them; as many as a code has numbers give the full
+(`curvature.py`). `gauss-newton:20` takes 20 of them; the dimension of the code gives the full
 matrix. On a CPU a product with the matrix takes as long as a gradient, and the Jacobian of a
-100-number code as long as 47 of them.
+100-number code as long as 47 gradients.
 """
 
 from typing import NamedTuple
@@ -86,8 +86,8 @@ def gauss_newton(
     anew, at the cost of one gradient and `directions` products; where not, the damping grows. The
     first iteration only finds the model. The state keeps the model of the best point, so that the
     curvature of the objective can be had from it. The objectives of `refine` and `js.objective`
-    have a Gauss-Newton matrix; of a plain function of JAX it is the Hessian, whose negative
-    curvature counts as 0.
+    have a Gauss-Newton matrix; for a plain function of JAX the matrix is the Hessian, whose
+    negative curvature counts as 0.
 
     Args:
         dim: Numbers in a point, 1 or more.

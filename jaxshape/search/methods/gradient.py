@@ -31,8 +31,8 @@ from jaxshape.search.refiner import (
 )
 
 STEP_SIZES = {"raw": 0.14, "whitened": 20.0}
-"""Step size of plain descent: the paper's for raw codes, and for whitened codes one that is as good
-as any on procedural chairs and oscillates only at three times its length."""
+"""Step size of plain descent: the paper's for raw codes; for whitened codes the best on procedural
+chairs, where descent oscillates only with three times this step."""
 
 LIKE_PLAIN_DESCENT = {
     "adagrad",
@@ -46,8 +46,8 @@ LIKE_PLAIN_DESCENT = {
 descent."""
 
 LEARNING_RATE = 0.1
-"""Learning rate of the other optimisers that have none of their own, in either space; most of them
-turn the gradient into steps of about this length in each coordinate."""
+"""Learning rate of optimisers without an entry, in either space; most of them turn the gradient
+into steps of about this length in each coordinate."""
 
 LEARNING_RATES = (
     dict.fromkeys(["adafactor", "fromage", "lamb", "lion", "rmsprop"], 0.02)
@@ -154,10 +154,10 @@ def gradient(
     """Descend the gradient of the objective.
 
     Optimisers with a line search (`optax.lbfgs`) work too; theirs evaluates the objective more
-    than once per step. Each step evaluates the current point and then moves it, so the point that
-    the last step arrives at is in `mean` and not yet in `best`. A loss or gradient that is not
-    finite sends the search back to the best point, with the optimiser started afresh; where the
-    same step fails every time, the search stays there.
+    than once per step. Each step evaluates the current point and then moves it, so the end point of
+    the last step is in `mean`, but not in `best`. A loss or gradient that is not finite sends the
+    search back to the best point, with the optimiser started afresh; where the same step fails
+    every time, the search stays there.
 
     Args:
         optimizer: An optax optimiser, or a number above 0: the step size of plain descent (paper:

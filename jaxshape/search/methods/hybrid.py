@@ -1,8 +1,8 @@
 """CMA-ES first, then descent along the gradient from the best it found: `hybrid`, `hybrid:adam`.
 
 The population finds the basin of a minimum and the gradient finds its floor. Far from the encoder's
-guess gradients stall, and near a minimum a population of 17 needs hundreds of evaluations for what
-one gradient shows. The second search is L-BFGS by default.
+guess gradients stall, and near a minimum a population of 17 needs hundreds of evaluations to learn
+what one gradient shows. The second search is L-BFGS by default.
 """
 
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ class HybridState(NamedTuple):
     """The two searches, of which one is active.
 
     Attributes:
-        mean: Where the active search stands `[d]`.
+        mean: Mean of the active search `[d]`.
         best: The best candidate so far.
         stop: Why the search ended, as a `StopReason`; RUNNING while it goes on.
         searched: State and trace of the first search.
@@ -54,7 +54,7 @@ def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
 
 
 def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
-    """One search, then another one from the best point that it found.
+    """One search, then a second one from the best point of the first.
 
     Args:
         search: The first search, which runs until it stops or has used its iterations.
