@@ -13,7 +13,7 @@ import jaxshape as js
 from jaxshape.data.capture import camera_distance
 from jaxshape.model.config import Precision
 from jaxshape.model.shapes import ShapePrior
-from jaxshape.search.objective import Own, evaluation
+from jaxshape.search.objective import ObjectTerms, evaluation
 from jaxshape.search.residuals import Target
 from jaxshape.search.run import Refined
 from jaxshape.search.space import whitened
@@ -77,7 +77,7 @@ def score(
     model: js.ShapeModel, decoder: js.Prepared, codes: Float[Array, "n d"], target: Target
 ) -> Float[Array, " n"]:
     """Eq. 7 of each candidate of one object, as a search scores them."""
-    own = Own(decoder.own, target, jnp.float32(0))
+    own = ObjectTerms(decoder.own, target, jnp.float32(0))
     how = evaluation(model, decoder, js.BALANCED, None, codes[0], own)
     return jax.vmap(how.loss, (None, 0, None))(how.shared, codes, own)
 

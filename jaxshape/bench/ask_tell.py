@@ -15,7 +15,7 @@ from jaxshape.search.config import RefineConfig
 
 
 class Asker(Protocol):
-    """One search that is asked for points and told what they cost."""
+    """A search that proposes points and takes their losses."""
 
     def ask(self) -> Float[np.ndarray, "n d"]:
         """The points to evaluate next."""
@@ -41,7 +41,7 @@ def pycma(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
 
     Args:
         variant: None; there are no variants.
-        dim: Numbers in a point.
+        dim: Dimension of a point.
         config: Settings of the search; `population`, `sigma0` and `bound` are used.
 
     Raises:
@@ -78,12 +78,12 @@ def nevergrad(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
     Args:
         variant: Name in nevergrad's registry, such as `TwoPointsDE`; None for `NGOpt`, its own
             choice among all.
-        dim: Numbers in a point.
+        dim: Dimension of a point.
         config: Settings of the search: `population` candidates are asked for at a time,
             `iterations` times; `sigma0` is the scale of a mutation, `bound` a box.
 
     Raises:
-        ValueError: The package has no such optimiser, or is not installed.
+        ValueError: The package lacks this optimiser, or is not installed.
     """
     ng = _imported("nevergrad")
     name = variant or "NGOpt"
@@ -100,7 +100,7 @@ def nevergrad(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
             array.random_state.seed(seed)
             calls, together = config.iterations * config.population, config.population
             self.optimizer = ng.optimizers.registry[name](array, calls, num_workers=together)
-            self.optimizer.suggest(np.float64(point))  # else some begin anywhere
+            self.optimizer.suggest(np.float64(point))  # otherwise some optimisers start at random
 
         def ask(self):
             with warnings.catch_warnings():

@@ -146,9 +146,9 @@ def _details(one: Standing) -> str:
         for name, row in one.entry.rows.items()
     ]  # fmt: skip
     head = ("problem", "calls", "s", "stopped by", "first", "objective", "first", "IoU")
-    told = html_table(head, rows, (1, 2, 4, 5, 6, 7))
+    results = html_table(head, rows, (1, 2, 4, 5, 6, 7))
     return (
         f"<section><details><summary>{escape(one.name)}</summary>"
         f'<p class="soft">{escape(settings)}; budget {about["budget"]}, seed {about["seed"]}</p>'
-        f"{told}</details></section>"
+        f"{results}</details></section>"
     )

@@ -27,7 +27,7 @@ LEFT = tuple(10 ** (-k / 10) for k in range(1, 21))
 and the lowest known one, from 0.79 to 0.01."""
 
 GAINS = (0.01, 0.02, 0.04, 0.08, 0.16)
-"""Targets by IoU: what a shape has over that of the first code."""
+"""Targets by IoU: the gain over the shape of the first code."""
 
 AT_A_TIME = 8
 """Problems searched together, by default: the rows that are scored together on a CPU."""
@@ -35,7 +35,7 @@ AT_A_TIME = 8
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """Settings of the searches of a benchmark; what `RefineConfig` says of them holds here.
+    """Settings of the searches of a benchmark; `RefineConfig` explains those of the search.
 
     Attributes:
         population: Candidates per iteration of a population search, 3 or more.
@@ -48,7 +48,7 @@ class BenchConfig:
             this, 0 or more, in nats per voxel; 0 never stops it.
         budget: Decoder calls that each problem may spend, 8 to 2,048; a gradient counts as three.
         seed: Seed of the searches, 0 or more.
-        at_a_time: Problems searched together, 1 or more. It changes seconds, and nothing else.
+        at_a_time: Problems searched together, 1 or more. It changes only the seconds.
 
     Raises:
         ValueError: A setting is outside its range.
@@ -77,7 +77,7 @@ class BenchConfig:
         return RefineConfig(iterations=iterations, **self.of_search())
 
     def of_search(self) -> dict[str, Any]:
-        """The settings that are those of the search, by name."""
+        """The settings of the search, by name."""
         own = {field.name for field in fields(RefineConfig)}
         return {name: value for name, value in asdict(self).items() if name in own}
 

@@ -24,12 +24,12 @@ from jaxshape.search.space import LatentSpace
 
 
 class Outcome(NamedTuple):
-    """What became of problems that were searched together.
+    """The result of problems that were searched together.
 
     Attributes:
-        observer: What was evaluated of them.
-        stops: By problem, why its search stopped: the name of a `StopReason`, or what the search
-            itself said.
+        observer: The evaluations of the problems.
+        stops: By problem, why its search stopped: the name of a `StopReason`, or the search's own
+            reason.
         compiling: Time that compiling took, in seconds; next to none but for the first problems.
     """
 
@@ -90,12 +90,12 @@ def _must_be_alone(refiner: Refiner, field: "_Field", example: Problem) -> bool:
 
 
 class _Field(NamedTuple):
-    """Where a method is run.
+    """The decoder and coordinates in which a method is run.
 
     Attributes:
         decoder: The shape prior, which takes points of the search space for codes.
         space: Coordinates of the search.
-        observer: Counts what is evaluated.
+        observer: Counts the evaluations.
     """
 
     decoder: ShapePrior
@@ -135,9 +135,9 @@ class _Start(NamedTuple):
     Attributes:
         targets: Targets of the problems `[problem ...]`.
         codes: First codes `[problem d]`.
-        points: The same in the search space `[problem d]`.
+        points: First codes in the search space `[problem d]`.
         losses: Objectives of the first codes `[problem]`.
-        seeds: A seed for each problem, whatever its company.
+        seeds: A seed for each problem, independent of the other problems.
     """
 
     targets: Target
@@ -226,7 +226,7 @@ def _on_the_host(search: AskTell, field: _Field) -> Contestant:
 def _stacked(
     asked: Sequence[Float[np.ndarray, "n d"]], stops: Sequence[str | None]
 ) -> Float[np.ndarray, "problem m d"]:
-    """The points of all searches; NaN beside them, and for those that have stopped."""
+    """The points of all searches, padded by NaN; all NaN for searches that have stopped."""
     points = np.full((len(asked), max(map(len, asked)), asked[0].shape[1]), np.nan, np.float32)
     for i, (one, stop) in enumerate(zip(asked, stops, strict=True)):
         if stop is None:

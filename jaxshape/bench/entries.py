@@ -1,11 +1,11 @@
-"""An entry: the file that holds the results of one method, and what makes it valid. [host]
+"""An entry: the file that holds the results of one method, and its validation. [host]
 
     {"format", "set", "sha256", "name", "method", "settings", "budget", "seed",   what was run
      "machines": {key: ...},                                                       where
      "rows": {problem: ...}}                                                       with what result
 
-A row is what `scoring` keeps, with the machine and how busy that was, how many problems were
-searched `together`, and the seconds that `compiling` took.
+A row holds the figures of `scoring`, the machine and its load, the number of problems searched
+`together`, and the seconds spent `compiling`.
 """
 
 import hashlib
@@ -43,8 +43,8 @@ class Entry(NamedTuple):
     """The results of one method, or a part of them.
 
     Attributes:
-        about: What was run: `format`, `set` and `sha256` of the problem set, `name`, `method`,
-            `settings`, `budget` in decoder calls, `seed`.
+        about: The search and its problems: `format`, `set` and `sha256` of the problem set, `name`,
+            `method`, `settings`, `budget` in decoder calls, `seed`.
         machines: The machines that rows name, by a key.
         rows: Results by problem.
     """
@@ -67,7 +67,7 @@ def new_entry(
     Args:
         name: Name of the method on the board.
         method: Name by which the search can be built; None for a loop of your own.
-        settings: What a reader needs to repeat the search, as JSON can hold it.
+        settings: Everything that a reader needs to repeat the search, as JSON can hold it.
         budget: Decoder calls that each problem could spend.
         seed: Seed of the searches.
     """
@@ -130,13 +130,15 @@ def read_entry(path: Path) -> Entry:
 
 
 def read_entries(paths: Iterable[Path]) -> list[Entry]:
-    """Read entries, and merge the parts of each; those of a name must agree in all but rows.
+    """Read entries, and merge the parts of each; parts of one name must agree in everything but
+    rows.
 
     Args:
         paths: The files.
 
     Raises:
-        ValueError: A file is no entry, or two of one name differ in what was run.
+        ValueError: A file is no entry, or two files of one name differ in the search, its budget or
+            its seed.
     """
     found: dict[str, Entry] = {}
     for path in sorted(paths):
@@ -160,11 +162,11 @@ def file_name(name: str, part: str = "") -> str:
     return f"{stem}{'.part-' + part.replace('/', '-of-') if part else ''}.json"
 
 
-# ------------------------------------------------------------------ what makes it valid
+# ------------------------------------------------------------------ validation
 
 
 def faults(entry: Entry, problems: Sequence[Problem]) -> list[str]:
-    """What is wrong with an entry, in sentences; none of a valid one.
+    """The faults of an entry, in sentences; empty for a valid entry.
 
     Objectives and overlaps are computed again from the codes that the entry holds.
 
@@ -186,13 +188,13 @@ def faults(entry: Entry, problems: Sequence[Problem]) -> list[str]:
             try:
                 fault = _fault(row, known[name], about["budget"])
             except (KeyError, TypeError, ValueError, IndexError) as problem:
-                fault = f"a figure is missing or of another form ({problem})"
+                fault = f"a figure is missing or malformed ({problem})"
             found += [f"{name}: {fault}."] if fault else []
     return found
 
 
 def _fault(row: Row, problem: Problem, budget: int) -> str | None:
-    """What is wrong with a row."""
+    """The fault of a row; None for a valid row."""
     objective, ious = np.array(row["objective"], float), np.array(row["iou"], float)
     # A row without any target reached has pairs too, none.
     reached, goals = np.array(row["reached"], float).reshape(-1, 2), np.array(targets(problem))
@@ -206,13 +208,13 @@ def _fault(row: Row, problem: Problem, budget: int) -> str | None:
         return f"it spent {row['calls']} decoder calls of {budget}"
     calls = reached[:, 0]
     if len(calls) > len(LEFT) or np.diff(reached, axis=0).min(initial=0) < 0:
-        return "targets are reached in another order than that of their difficulty"
+        return "targets are not reached in the order of their difficulty"
     if calls.max(initial=0) > budget:
         return "a target is reached after the budget was spent"
     at_rungs = np.array([sum(calls <= rung) for rung in LADDER])
     fewest, most = ((objective[:, None] <= goals * (1 + s * CLOSE)).sum(1) for s in (-1, 1))
     if (at_rungs < fewest).any() or (at_rungs > most).any():
-        return "targets are reached where the objective says otherwise"
+        return "the reached targets contradict the objective"
     code = unpacked_code(row["code"])
     again, overlap = _again(problem.decoder, problem.target, jnp.asarray(problem.surface), code)
     if not _close(float(again), objective[-1]):
@@ -224,7 +226,7 @@ def _fault(row: Row, problem: Problem, budget: int) -> str | None:
 
 @jax.jit
 def _again(decoder, target, surface, code):
-    """Objective and IoU of a code, computed anew."""
+    """Objective and IoU of a code, computed again."""
     loss = objective(decoder, target, residual=EQUATION_7)(code)
     return loss, iou(decode(decoder, code) > 0, surface)
 

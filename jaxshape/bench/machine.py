@@ -35,7 +35,7 @@ def load() -> float | None:
 
 
 def _cores() -> int:
-    """Those this process may use."""
+    """Processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

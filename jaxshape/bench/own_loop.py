@@ -76,7 +76,7 @@ class Watch:
         return self._watched(jnp.asarray(number, jnp.int32))(code)
 
     def begin(self, number: int | None = None) -> None:
-        """Start counting anew, and the clock; what came before was to compile.
+        """Start the clock and count from 0; everything before was compilation.
 
         Args:
             number: Number of the problem that is searched from now on, by itself; None where all
@@ -127,7 +127,7 @@ def enter_benchmark(
         folder: Folder of the board.
         name: Name of your search on the board.
         rows: Results by the names of the problems (`Watch.rows`).
-        settings: What a reader needs to repeat the search, as JSON can hold it.
+        settings: Everything that a reader needs to repeat the search, as JSON can hold it.
         budget: The budget that was watched.
         seed: Seed of the searches.
 

@@ -1,9 +1,9 @@
-"""The frozen problems: what was measured of chairs and seats, and their true surfaces. [host]
+"""The frozen problems: measurements of chairs and seats, and their true surfaces. [host]
 
-A set is two files of one name: the grids (`.npz`, packed as in a dataset), and what belongs to them
-(`.json`): the objects with their makers, the weights whose codes are searched, and the lowest
-objective known of each problem. experiments/bench_set.py made both. A set never changes; another
-one gets another name.
+A set is two files of one name. The `.npz` file holds the grids, packed as in a dataset. The `.json`
+file holds the objects with their makers, the fingerprint of the weights, and the lowest known
+objective of each problem. experiments/bench_set.py made both. A set never changes; another one gets
+another name.
 """
 
 import hashlib
@@ -24,11 +24,11 @@ SHA256 = "3e51b57120826df6eca017f1be39cd830519a69e3e4ae0d22ee2529f7a5ae07b"
 
 
 class ProblemSet(NamedTuple):
-    """What was measured of some objects after some numbers of frames.
+    """Measurements of some objects after some numbers of frames.
 
     Attributes:
         name: Name of the set, with its version.
-        objects: Of each object its name, and where it comes from.
+        objects: Name and source of each object.
         measured: By kind, F and M of each object and number of frames `[object number voxels]`, as
             `pack_measured` packs them.
         surfaces: True surface voxels of each object `[object bytes]`, as `pack` packs them.
@@ -86,7 +86,7 @@ def write_set(folder: Path, found: ProblemSet) -> None:
 
 
 def fingerprint(found: ProblemSet) -> str:
-    """A hash of all that a set holds, whatever its files were compressed by.
+    """A hash of the content of a set, independent of the compression of its files.
 
     Args:
         found: The set.

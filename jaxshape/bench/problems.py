@@ -24,10 +24,10 @@ WEIGHTS = "chair-autoencoder"
 """The packaged weights whose codes are searched."""
 
 RESIDUALS = {"clean": BALANCED, "noisy": SOFT}
-"""What is minimised: the default objective of each kind of grids."""
+"""The default objective of each kind of grids."""
 
 EQUATION_7 = Residual(BALANCED.target, cross_entropy)
-"""Scores the targets of either."""
+"""Scores the targets of both residuals."""
 
 
 BOX = 10.0
@@ -41,8 +41,8 @@ class Problem(NamedTuple):
     Attributes:
         name: Name of the problem: `object/frames/kind`.
         prior: The shape prior whose codes are searched.
-        decoder: The same with its parameters prepared once for all; it cannot encode.
-        grids: What was measured, F and M `[x y z]`, as probabilities.
+        decoder: The same prior with its parameters prepared in advance; it cannot encode.
+        grids: The measurement, F and M `[x y z]`, as probabilities.
         surface: True surface voxels `[x y z]`, which no search may use.
         target: Weights of Eq. 7 for each voxel.
         first_code: The encoder's code `[d]`, where every search starts.
@@ -61,7 +61,7 @@ class Problem(NamedTuple):
     best_objective: float
 
     def objective(self, code: Float[Array, " d"]) -> Float[Array, ""]:
-        """What a search minimises (Eq. 7), in nats per voxel.
+        """The objective of a search (Eq. 7), in nats per voxel.
 
         A pure function of JAX: differentiate it, and `jax.vmap` it over codes.
 
@@ -113,8 +113,8 @@ def problems(
     """The problems of the benchmark, or some of them. [host]
 
     Args:
-        objects: How many objects, the first of the set; None for all. Two of three are procedural
-            chairs, the third is a CAD seat.
+        objects: Number of objects, from the first of the set; None for all. Two of three are
+            procedural chairs, the third is a CAD seat.
         frames: Numbers of fused frames, among 1, 4 and 8.
         kinds: `clean` for points of the paper's camera without noise, `noisy` for signed distances
             of a Kinect's noisy frames.
@@ -125,7 +125,7 @@ def problems(
         One problem for each object, number of frames and kind.
 
     Raises:
-        ValueError: No problem is left, or the weights are not those of the set.
+        ValueError: No problem is left, or the set was made for other weights.
     """
     found = packaged_set() if problem_set is None else problem_set
     prior = load_prior(WEIGHTS) if prior is None else prior
@@ -142,8 +142,8 @@ def problems(
     ]
     if not chosen:
         raise ValueError(
-            f"{found.name} has no such problem; give objects from 1 to {len(found.objects)}, frames"
-            f" among {', '.join(map(str, FRAMES))} and kinds among {', '.join(KINDS)}."
+            f"{found.name} has no matching problem; give objects from 1 to {len(found.objects)},"
+            f" frames among {', '.join(map(str, FRAMES))} and kinds among {', '.join(KINDS)}."
         )
     both = prior, _prepared(prior)
     made = {one.name: one for kind in KINDS for one in _of_kind(found, both, kind, chosen)}
@@ -151,7 +151,7 @@ def problems(
 
 
 def _prepared(prior: ShapePrior) -> ShapePrior:
-    """A prior whose model has nothing left to prepare."""
+    """A prior with prepared parameters."""
     params = jax.jit(lambda prior: prior.model.prepare(prior.params, None, "float32").shared)(prior)
     return prior._replace(model=replace(prior.model, prepare=share_all), params=params)
 
@@ -159,7 +159,7 @@ def _prepared(prior: ShapePrior) -> ShapePrior:
 def _of_kind(
     found: ProblemSet, priors: tuple[ShapePrior, ShapePrior], kind: str, keys: Sequence
 ) -> list[Problem]:
-    """The problems of one kind among those of some keys."""
+    """The problems of one kind among some keys."""
     keys = [key for key in keys if key[3] == kind]
     if not keys:
         return []

@@ -24,7 +24,7 @@ class BenchProgress(NamedTuple):
 
     Attributes:
         name: Name of the entry that is being made.
-        done: Problems that it has results of, of those asked for.
+        done: Requested problems with results.
         total: Problems that were asked for.
     """
 
@@ -43,7 +43,7 @@ def run(
 ) -> Iterator[BenchProgress]:
     """Run methods on problems, and write an entry for each.
 
-    Problems of which the folder holds results already, in whichever part, are not searched again.
+    Problems of which any part in the folder holds results are not searched again.
 
     Args:
         methods: Names of the searches.
@@ -57,8 +57,8 @@ def run(
         The progress, for each method at first and after each batch.
 
     Raises:
-        ValueError: There is no such method, or the folder holds results of the same method that
-            were made in another way.
+        ValueError: The method is unknown, or the folder holds results of the same method with other
+            settings.
     """
     settings = config.search()
     searches = {one: contestant(one, problems[0], settings, config.budget) for one in methods}

@@ -1,4 +1,4 @@
-"""What is kept of the search of a problem: when it reached which target, and shapes. [host]"""
+"""The figures of the search of a problem: when it reached each target, and its shapes. [host]"""
 
 import base64
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import decode
 
 Row = dict[str, Any]
-"""Of one problem: `calls` and `seconds` spent, `stop`; at each step of `LADDER` the `objective` and
-`iou` of the best code so far; `reached`, calls and seconds at each target by objective, in order,
-as far as they were reached; `code`, the last of these codes."""
+"""The figures of one problem: `calls` and `seconds` spent, `stop`; at each step of `LADDER` the
+`objective` and `iou` of the best code so far; `reached`, calls and seconds at each target by
+objective, in order, as far as they were reached; `code`, the last of these codes."""
 
 
 def rows_of(
@@ -28,7 +28,7 @@ def rows_of(
 
     Args:
         problems: The problems.
-        observer: What was evaluated of them.
+        observer: The evaluations of the problems.
         stops: Why each search stopped, in a word.
     """
     ladders = [[_best_within(found, rung) for rung in LADDER] for found in observer.improvements]

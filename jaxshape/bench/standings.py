@@ -17,13 +17,13 @@ NEAR = next(i for i, left in enumerate(LEFT) if left < 0.0502)
 
 
 class Standing(NamedTuple):
-    """One entry on the problems that all entries have.
+    """An entry, restricted to the problems that all entries have.
 
     Attributes:
         entry: The entry, with these problems alone.
         calls: Decoder calls at which each target by objective was reached `[problem target]`; +inf
             where it was not.
-        seconds: The same in seconds.
+        seconds: Seconds at which each target was reached `[problem target]`; +inf where it was not.
         gap: Share of the gap between the first and the lowest known objective that is left, at each
             rung of the ladder `[problem rung]`.
         iou: IoU of the best code so far at each rung `[problem rung]`.
@@ -140,8 +140,8 @@ ABOUT = (
     "The first figures are the shares of targets that were reached within so many decoder calls, or"
     f" seconds, of each problem. Targets by objective leave {LEFT[0]:.0%} to {LEFT[-1]:.0%} of the"
     " gap between the objective of the first code and the lowest known. Calls and seconds to 95 %"
-    " are medians over problems, a dash where fewer than half were brought so near. IoU is that of"
-    " the last best code, gained what it has over the first code's; targets by IoU are gains of"
+    " are medians over problems, a dash where fewer than half came so near. IoU is the IoU of"
+    " the last best code, gained its gain over the first code; targets by IoU are gains of"
     f" {', '.join(f'{gain:g}' for gain in GAINS)} along the way. A gradient counts as three calls."
 )
 
@@ -150,7 +150,7 @@ def headings(line_break: str) -> list[str]:
     """The columns with their names on two lines.
 
     Args:
-        line_break: What ends a line.
+        line_break: Text between two lines.
     """
     return [re.sub(" (calls|to|targets)", rf"{line_break}\1", column) for column in COLUMNS]
 

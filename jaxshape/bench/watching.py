@@ -1,10 +1,9 @@
 """Every evaluation of a search, counted by the problem and not by the search. [host]
 
-A watched objective is the objective itself, with one side effect: whatever evaluates it, in a
-compiled loop or outside, tells the observer which codes were evaluated and what they cost. A search
-so can neither forget an evaluation nor count one twice, and its own idea of its budget plays no
-part. A candidate is one decoder call. A gradient, a pass forward and one back, takes the time of
-three and counts as three.
+A watched objective is the objective itself with one side effect: each evaluation, in a compiled
+loop or outside, reports its codes and losses to the observer. A search can thus neither forget an
+evaluation nor count one twice, and its own count does not matter. A candidate is one decoder call.
+A gradient, a pass forward and one back, takes the time of three and counts as three.
 """
 
 import time
@@ -30,7 +29,7 @@ class Improvement(NamedTuple):
     Attributes:
         calls: Decoder calls spent up to it, itself included; 0 for the first code.
         seconds: Time since the search began.
-        loss: Its objective, in nats per voxel.
+        loss: Objective of the code, in nats per voxel.
         code: The code `[d]`.
     """
 
@@ -41,10 +40,10 @@ class Improvement(NamedTuple):
 
 
 class Observer:
-    """What a search evaluated of some problems, each within the same budget.
+    """The evaluations of some problems by a search, each within the same budget.
 
-    What is evaluated after the budget is spent does not count; nor does a gradient that only
-    begins within it.
+    Evaluations after the budget is spent do not count; neither does a gradient that only begins
+    within it.
 
     Attributes:
         budget: Decoder calls that each problem may spend.
@@ -79,10 +78,10 @@ class Observer:
         self._clocks = [(time.perf_counter(), 1 / count)] * count
 
     def begin_alone(self, problem: int) -> None:
-        """Start counting one of these problems anew, which is searched by itself from now on.
+        """Start counting one of these problems from 0; it is searched by itself from now on.
 
         Args:
-            problem: Its number.
+            problem: Number of the problem.
         """
         self.calls[problem], self.seconds[problem] = 0, 0.0
         self.improvements[problem] = self.improvements[problem][:1]
@@ -126,8 +125,8 @@ def watched(
     """The objectives of some problems, watched.
 
     Args:
-        objective_of: The objective of a problem, by its number. One that is `Composed`, so that a
-            search can ask for it to second order, stays so.
+        objective_of: The objective of a problem, by its number. A `Composed` objective stays
+            `Composed`, so that a search can expand it to second order.
         observer: Learns of every evaluation.
         to_code: The code of a point that the objectives take.
 
@@ -136,16 +135,16 @@ def watched(
         under `jax.grad`.
     """
 
-    def told(cost, owner, point, loss):
+    def reported(cost, owner, point, loss):
         return _telling(observer, cost)(owner, to_code(point), loss)
 
     @jax.custom_vjp
     def loss_of(point, owner):
-        return told(1, owner, point, objective_of(owner)(point))
+        return reported(1, owner, point, objective_of(owner)(point))
 
     def with_slope(point, owner):
         value, slope = jax.value_and_grad(objective_of(owner))(point)
-        return told(GRADIENT, owner, point, value), slope
+        return reported(GRADIENT, owner, point, value), slope
 
     loss_of.defvjp(with_slope, lambda slope, ct: (ct * slope, None))
 
@@ -159,7 +158,7 @@ def watched(
             """A product with the matrix takes the time of a gradient."""
             found = objective.expansion(point, directions)
             cost = GRADIENT * (1 + len(found.directions))
-            return found._replace(loss=told(cost, owner, point, found.loss))
+            return found._replace(loss=reported(cost, owner, point, found.loss))
 
         return Composed(loss, expansion) if isinstance(objective, Composed) else loss
 
@@ -189,8 +188,8 @@ def _telling(observer: Observer, cost: int) -> Callable[..., Float[Array, ""]]:
 def evaluates_in_a_branch(step: Callable[..., Any], *examples: Any) -> bool:
     """Whether a step evaluates a watched objective within a loop or a branch of unknown length.
 
-    In a batch, such a loop runs as long as the longest of all, and every branch is taken: a problem
-    would pay for the others.
+    In a batch, such a loop runs until the last problem has finished, and every branch is taken:
+    each problem would pay for the others.
 
     Args:
         step: One step of one problem.

@@ -2,8 +2,8 @@
 
 Each subcommand is a frozen dataclass: its fields are its options, its docstring is its help, and
 its `run` does the work. Bad input ends with one sentence on standard error and exit status 2, and
-leaves earlier output as it was. JAX, and all that needs it, is imported inside `run`, so that
-`--help` answers at once.
+leaves earlier output as it was. JAX, and every module that needs it, is imported inside `run`, so
+that `--help` answers at once.
 
     rebuild    demo
     recording  reconstruct
@@ -86,11 +86,11 @@ def main() -> None:
             output = asked
             command.run()
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever reads the answer has enough
+    except BrokenPipeError:  # the reader of a pipe has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except (RefusedSetting, ValueError, OSError, MemoryError) as problem:
-        # Sentences for the user, by the convention of the package; anything else is a bug.
+        # By the convention of the package these are sentences for the user; other errors are bugs.
         console.print(f"[red]jaxshape:[/] {escape(_sentence(problem, output))}", soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt as stop:
@@ -100,7 +100,7 @@ def main() -> None:
 
 
 def _sentence(problem: Exception, output: Output | None) -> str:
-    """What went wrong, and what is left."""
+    """The error, and the files that are left."""
     if isinstance(problem, MemoryError):
         return "The memory of this machine does not suffice."
     if isinstance(problem, OutputError):

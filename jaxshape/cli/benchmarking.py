@@ -43,11 +43,11 @@ class Bench:
     folder."""
     search: tyro.conf.OmitArgPrefixes[BenchConfig] = BenchConfig()
     check: bool = False
-    """Run nothing; say what is wrong with the results in the folder, computing objectives anew."""
+    """Run nothing; validate the results in the folder, computing objectives again."""
 
     @property
     def writes(self) -> Output | None:
-        """What is written; the parts of a board may be made at the same time."""
+        """The folder that is written; the parts of a board may be made at the same time."""
         if self.check:
             return None
         i, n = _part(self.part)
@@ -95,7 +95,7 @@ def _part(text: str) -> tuple[int, int]:
 
 
 def _check(folder: Path) -> None:
-    """Say what is wrong with the results of a folder."""
+    """Print the faults of the results in a folder."""
     from jaxshape.bench.entries import faults, read_entries
     from jaxshape.bench.problems import problems
 

@@ -1,4 +1,4 @@
-"""What commands say about a folder of meshes before they use it: units, axes, what is left out."""
+"""Checks of a folder of meshes before commands use it: units, axes, unusable meshes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,14 +16,14 @@ from jaxshape.cli.common import (
 from jaxshape.cli.options import Axes
 
 SAMPLE = 200
-"""Meshes that are looked at where not all of them need be."""
+"""Number of meshes that are checked where a sample suffices."""
 
 VOTERS = 12
 """Meshes that vote on the axes: each takes about a second."""
 
 
 def find_meshes(path: Path) -> list[Any]:
-    """The meshes (`MeshSource`) at a path; says what else there was."""
+    """The meshes (`MeshSource`) at a path; prints the other files found there."""
     from jaxshape.data.archives import list_meshes, passed_over
 
     sources = list_meshes(path)
@@ -34,7 +34,7 @@ def find_meshes(path: Path) -> list[Any]:
 
 
 def look_at(sources: Sequence[Any], axes: Axes, workers: int | None = None) -> list[Any]:
-    """What is known of each mesh (`Surveyed`), with a bar, and a warning where sizes are odd."""
+    """The survey of each mesh (`Surveyed`), with a progress bar, and a warning about odd sizes."""
     from jaxshape.data.survey import doubted_size, survey
 
     found: list[Any] = [None] * len(sources)
@@ -54,7 +54,8 @@ def look_at(sources: Sequence[Any], axes: Axes, workers: int | None = None) -> l
 def load_models(
     sources: Sequence[Any], axes: Axes, *, refuse: bool = True
 ) -> tuple[list[Any], list[Any]]:
-    """The meshes (`Model`) that can be used, and those `Skipped`; it may refuse to use none."""
+    """The usable meshes (`Model`) and the `Skipped` ones; it may refuse a folder without usable
+    ones."""
     from jaxshape.data.dataset import load_object
     from jaxshape.data.meshes import Skipped
     from jaxshape.data.survey import doubted_size
@@ -92,7 +93,7 @@ def turned(sources: Sequence[Any], axes: Axes, prior: Any = None) -> list[Any]:
 
     scores = _scores(sources, axes, prior)
     if not scores:
-        warn("These are no seats, the only things that --axes auto knows; --up and --front hold.")
+        warn("--axes auto knows only seats, and these are none; --up and --front apply.")
         return list(sources)
     usual = usual_axes(scores, (axes.up, axes.front))
     others = dissenting(scores, usual)
@@ -111,8 +112,8 @@ def check_axes(
 ) -> None:
     """Warn where the axes of a collection seem wrong, or differ within it.
 
-    `lying` names the meshes that seem to lie on their side. Those of which most meshes do are
-    refused, where it is certain that they are seats.
+    `lying` names the meshes that seem to lie on their side. Collections whose meshes mostly do are
+    refused if they are certainly seats.
     """
     from jaxshape.data.survey import evenly
     from jaxshape.model.facing import dissenting, usual_axes
@@ -159,7 +160,7 @@ def _flags(pair: tuple[str, str]) -> str:
 def _scores(
     sources: Sequence[Any], axes: Axes, prior: Any, ups: tuple[str, ...] | None = None
 ) -> dict[str, Any]:
-    """How well each pair of axes of the files fits each mesh; empty where nothing is known of their
+    """The fit of each pair of axes of the files to each mesh; empty where nothing is known of their
     kind: `prior` knows its own, the weights for chairs know seats."""
     from jaxshape.data.meshes import Skipped, load, resembles_a_seat
     from jaxshape.model.facing import are_known, facing_scores

@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 console = Console(stderr=True)
-"""Progress, warnings and errors; what a command answers goes to standard output."""
+"""Progress, warnings and errors; the answer of a command goes to standard output."""
 
 
 class BadInput(ValueError):
@@ -43,7 +43,7 @@ NAMED = 3
 
 
 def report_skipped(skipped: Iterable[Any]) -> None:
-    """Say how many meshes (`Skipped`) are left out for each reason, with the first of them."""
+    """Print the number of meshes (`Skipped`) left out for each reason, with the first names."""
     reasons: dict[str, list[Any]] = {}
     for one in skipped:
         reasons.setdefault(one.reason, []).append(one)
@@ -52,7 +52,7 @@ def report_skipped(skipped: Iterable[Any]) -> None:
 
 
 def report_notes(notes: Iterable[tuple[str, str]]) -> None:
-    """Say what files hold besides the object: names of meshes, and notes as of `Model`."""
+    """Print notes on parts of files that are not the object: names of meshes, and `Model.notes`."""
     kinds: dict[str, list[tuple[str, str]]] = {}
     for name, note in notes:
         kinds.setdefault(note.partition(" left out")[0], []).append((name, note))

@@ -16,11 +16,11 @@ from jaxshape.data.config import Axis
 
 @dataclass(frozen=True, kw_only=True)
 class Complete(Rebuild):
-    """Complete a point cloud or a fused model of one object, which holds nothing else.
+    """Complete a point cloud or a fused model of a single object.
 
-    Which way is up and to the front is found by the prior, among the axes of the file. What is free
-    is known by rays from --sensor to the points or, less of it, by normals in the file; without
-    both, what is not measured is all predicted.
+    The prior finds the axes of the file that point up and to the front. Free space is known along
+    rays from --sensor to the points, or, less of it, from normals in the file; without both, every
+    unmeasured voxel is predicted.
 
     Examples: jaxshape complete scan.ply
 
@@ -42,7 +42,7 @@ class Complete(Rebuild):
 
     @property
     def writes(self) -> Output:
-        """What is written."""
+        """The folder that is written."""
         return Output(self.output)
 
     def run(self) -> None:
@@ -101,5 +101,5 @@ def _of_rays(cloud: Any) -> list[str]:
         return []
     return [
         "Neither the sensor's position nor normals are known, so that holes cannot be told from "
-        "what was not seen; give --sensor, or a file with normals."
+        "unseen surface; give --sensor, or a file with normals."
     ]

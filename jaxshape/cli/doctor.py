@@ -1,4 +1,4 @@
-"""`jaxshape doctor`: what this machine gives jaxshape, and what makes it slow here."""
+"""`jaxshape doctor`: versions, devices and caches of this machine, and reasons for slowness."""
 
 import json
 import os
@@ -19,12 +19,13 @@ PACKAGES = (
     "jaxshape", "jax", "jaxlib", "flax", "optax", "evosax", "numpy", "scipy", "trimesh", "embreex",
     "scikit-image", "pillow", "viser", "OpenEXR",
 )  # fmt: skip
-"""Packages whose version decides what works; the last two and embreex are optional."""
+"""Packages whose versions matter; the last two and embreex are optional."""
 
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say which versions, devices, caches and weights jaxshape finds, and what is slow and why.
+    """Print the versions, devices, caches and weights that jaxshape finds, and reasons for
+    slowness.
 
     Examples: jaxshape doctor
 
@@ -71,7 +72,7 @@ def findings() -> dict[str, Any]:
 
 
 def advice(device: str) -> Iterator[str]:
-    """What makes this machine slow, and what helps."""
+    """Reasons for slowness on this machine, with remedies."""
     from jaxshape.process import processor
 
     features = processor().features
@@ -85,7 +86,7 @@ def advice(device: str) -> Iterator[str]:
     if find_spec("embreex") is None:
         yield "Without embreex, virtual cameras trace rays by trimesh alone, which is far slower."
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        yield "No folder for compiled programs can be written: every run compiles anew."
+        yield "No folder for compiled programs can be written: every run compiles again."
 
 
 def _version(name: str) -> str | None:

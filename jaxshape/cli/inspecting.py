@@ -1,4 +1,4 @@
-"""`jaxshape inspect`: what a recording holds, and what may be wrong with it."""
+"""`jaxshape inspect`: the content of a recording and its possible faults."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -39,12 +39,12 @@ ConventionName = Literal[
     "mirrored",
     "ray",
 ]
-"""Names of `jaxshape.data.sequences.conventions`, and that of none."""
+"""Names of `jaxshape.data.sequences.conventions`, and the name for our own convention."""
 
 
 @dataclass(frozen=True)
 class Inspect:
-    """Say what a recording holds, and warn of what looks wrong, with the evidence and a remedy.
+    """Describe a recording, and warn of possible faults, each with the evidence and a remedy.
 
     Example: jaxshape inspect scan/
     """
@@ -54,7 +54,7 @@ class Inspect:
     ICL-NUIM, Open3D, Stray Scanner, Record3D, nerfstudio, or rgb/ depth/ masks/ with cam_K.txt; or
     an .npz file of arrays."""
     depth_scale: float | None = None
-    """Depth units in a metre, above 0; those of the layout by default."""
+    """Depth units in a metre, above 0; the layout's by default."""
     layout: LayoutName | None = None
     """Layout of the files; detected by default."""
     convention: tuple[ConventionName, ...] = ()
@@ -131,7 +131,7 @@ def _color_delay(sequence: Any) -> dict[str, float] | None:
 
 
 def print_table(title: str, found: Any) -> None:
-    """The figures as a table, then each warning as a sentence and what to do."""
+    """The figures as a table, then each warning as a sentence with a remedy."""
     console = Console()
     table = Table(title=escape(title), show_header=False, title_justify="left")
     for row in _rows(as_json(found)):

@@ -42,7 +42,7 @@ TrainingPreset = Literal["default", "autoencoder", "paper"]
 
 @dataclass(frozen=True)
 class BuildDataset:
-    """Build training pairs: what cameras measure along paths about objects, and whole surfaces.
+    """Build training pairs: measurements along camera paths about objects, and complete surfaces.
 
     Examples: jaxshape dataset --output data/chairs
 
@@ -59,7 +59,7 @@ class BuildDataset:
     family: FamilyName = "chair"
     """Procedural objects to make, unless --meshes is given."""
     count: int = 8000
-    """How many of them."""
+    """Number of objects."""
     meshes: Path | None = None
     """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural objects."""
     preset: Preset = "default"
@@ -83,7 +83,7 @@ class BuildDataset:
 
     @property
     def writes(self) -> Output:
-        """What is written."""
+        """The folder that is written."""
         return Output(self.folder, goes_on=True, needs=max(limits.FREE_BYTES, self._missing()))
 
     def _missing(self) -> int:
@@ -117,7 +117,7 @@ class BuildDataset:
 
 
 def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: int) -> None:
-    """Build a dataset, or what is missing of it, with a bar."""
+    """Build a dataset, or its missing shards, with a progress bar."""
     from jaxshape.data import building
 
     skipped, notes = [], []
@@ -179,9 +179,9 @@ class Train:
     """A network, or principal components of the complete surfaces: a cheap rival, made in seconds,
     of which --code numbers and --seed are the only settings."""
     preset: TrainingPreset = "default"
-    """Network, and defaults of the options below: the network that is conditioned on what was
-    measured, the paper's auto-encoder at its best, or the paper's own training, which
-    `jaxshape train --preset paper --help` shows."""
+    """Network, and defaults of the options below: the network that is conditioned on the
+    measurement, the paper's auto-encoder at its best, or the paper's own training, which `jaxshape
+    train --preset paper --help` shows."""
     config: tyro.conf.OmitArgPrefixes[tyro.conf.AvoidSubcommands[TrainConfig]] = TrainConfig()
     machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
 
@@ -192,7 +192,7 @@ class Train:
 
     @property
     def writes(self) -> Output | None:
-        """What is written; None with several processes, of which the first writes."""
+        """The folder that is written; None with several processes, of which the first writes."""
         return None if self.machines.asked else Output(self.folder, goes_on=True)
 
     def run(self) -> None:
@@ -241,7 +241,7 @@ class Train:
             return prior._replace(calibration=fit_calibration(prior, kept.grids, kept.surface))
 
     def build(self, output: Path) -> tuple[Path, tuple[list[Any], list[Any]]]:
-        """The folder of a dataset of --meshes; the models kept out of it, and those skipped."""
+        """The folder of a dataset of --meshes; the models kept out of it, and the skipped ones."""
         import jax
 
         from jaxshape.data.split import hold_out
@@ -271,7 +271,7 @@ class Train:
         return output / "dataset", models
 
     def write(self, output: Path, prior: Any, about: dict[str, Any], held_out: Any) -> None:
-        """Write the weights and cards of a finished run, and score it on what was held out."""
+        """Write the weights and cards of a finished run, and score it on the held-out models."""
         from jaxshape.model.weights import load_prior, save_prior
         from jaxshape.report.card import describe
         from jaxshape.results.evaluation import EvaluateConfig

@@ -49,9 +49,9 @@ class Seen:
     no_noise: tyro.conf.FlagCreatePairsOff[bool] = False
     """Leave these faults out, as is done anyway for the paper's camera."""
     fusion: FusionName | None = None
-    """How frames become F and M: `distance` averages signed distances on a fine grid, `points`
-    counts points in voxels (paper). None for points where the paper's camera has no noise, else
-    for distances."""
+    """Method that turns frames into F and M: `distance` averages signed distances on a fine grid,
+    `points` counts points in voxels (paper). None for points with the paper's camera without noise,
+    and for distances otherwise."""
 
     def config(self) -> CameraConfig:
         """The settings, checked."""
@@ -74,7 +74,7 @@ class Machines:
     distributed: bool = False
     """Join the processes that Slurm or Open MPI started together."""
     coordinator: str | None = None
-    """Join processes started by hand: HOST:PORT of the first of them, the same for all."""
+    """Join processes started by hand: HOST:PORT of the first process, the same for all."""
     processes: int | None = None
     """With --coordinator: number of processes."""
     process: int | None = None
@@ -99,7 +99,7 @@ class Machines:
 
 
 class RefusedSetting(Exception):
-    """Settings refused what the parser gave them, in one sentence.
+    """Settings refused the values of the parser, in one sentence.
 
     Not a `ValueError`, for the parser would make a page of its own of that.
     """

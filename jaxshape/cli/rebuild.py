@@ -101,7 +101,7 @@ def written(folder: Path, observation: Any, found: Any, figures: dict[str, Any])
 
 
 def draw(folder: Path, observation: Any, found: Any, result: dict[str, Any]) -> None:
-    """Write the picture and the report of a result whose other files are written."""
+    """Write the picture and the report of a result after its other files."""
     from jaxshape.report.page import write_report
     from jaxshape.report.panels import write_overview
 
@@ -146,7 +146,7 @@ class Demo(Rebuild):
 
     @property
     def writes(self) -> Output:
-        """What is written."""
+        """The folder that is written."""
         return Output(self.output)
 
     def run(self) -> None:
@@ -174,7 +174,7 @@ class Demo(Rebuild):
         )
 
     def film(self, mesh: Any, seen: CameraConfig, resolution: int) -> tuple[Any, Any]:
-        """F and M of the mesh (`Grids`), and what there is to show of it (`Observation`)."""
+        """F and M of the mesh (`Grids`), and its frames for the report (`Observation`)."""
         import jax
         import numpy as np
 

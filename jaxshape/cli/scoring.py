@@ -43,7 +43,8 @@ class Evaluate:
     frames: str = "1,4,8,18"
     """Numbers of frames to fuse, separated by commas: the first k of an orbit, 20 degrees apart."""
     methods: str = "encoder,gradient,cma"
-    """Methods to score, separated by commas; those of `jaxshape reconstruct --method`."""
+    """Methods to score, separated by commas; the names are those of `jaxshape reconstruct
+    --method`."""
     seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     ceiling: bool = False
     """Score the best shape of the weights, too: the code fitted to the whole truth."""
@@ -56,7 +57,7 @@ class Evaluate:
 
     @property
     def writes(self) -> Output | None:
-        """What is written; several processes share it."""
+        """The file that is written; several processes share it."""
         return None if self.machines.asked else Output(self.output, is_file=True, goes_on=True)
 
     def run(self) -> None:
@@ -101,7 +102,7 @@ class Evaluate:
         score(self.output, prior, config, about, models, skipped, names, share)
 
     def check(self, sources: Sequence[Any], models: Sequence[Any], prior: Any) -> None:
-        """Refuse seats that lie on their side, and warn of those that face another way."""
+        """Refuse seats that lie on their side, and warn of seats that face another way."""
         from jaxshape.data.meshes import lying_on_its_side
 
         lying = [model.name for model in models if lying_on_its_side(model.mesh)]
@@ -120,12 +121,12 @@ def score(
     names: Sequence[str] | None = None,
     share: Any = None,
 ) -> dict[str, Any] | None:
-    """Score models, write the results file, print its table; returns what the file holds.
+    """Score models, write the results file, print its table; returns the content of the file.
 
     `config` is an `EvaluateConfig`; `about` says where meshes and weights come from. An evaluation
-    that was killed goes on when asked for again with the same weights and settings. Of several
-    processes each scores its share of all `names`, and whichever finishes last finds the rows of
-    the others and writes the file; the others return None. `share` is a `Share`; None for a single
+    that was killed goes on when asked for again with the same weights and settings. Several
+    processes each score their share of all `names`; the last to finish finds the rows of the others
+    and writes the file, and the others return None. `share` is a `Share`; None for a single
     process.
     """
     start = time.perf_counter()
@@ -219,7 +220,7 @@ class Plot:
 
     @property
     def writes(self) -> Output | None:
-        """What is written; None where that is in the folder of a result, which has to be there."""
+        """The file that is written; None where it goes into the folder of an existing result."""
         return None if self.output is None else Output(self.output, is_file=True)
 
     def run(self) -> None:

@@ -37,7 +37,7 @@ class ViewResult:
         )
         from jaxshape.report.viewer import view
 
-        def told(address: str) -> None:
+        def show_address(address: str) -> None:
             print(f"{address} shows {self.result}; Ctrl-C ends", flush=True)
 
-        view(self.result, host=self.host, port=self.port, told=told)
+        view(self.result, host=self.host, port=self.port, on_start=show_address)

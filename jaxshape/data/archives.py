@@ -48,9 +48,9 @@ class MeshSource(NamedTuple):
         path: The file on disk: a mesh, or the archive that holds it.
         member: Name of the member inside the archive; None for a file of its own.
         metadata: Entries of a furniture catalogue for the mesh, under the catalogue's own field
-            names; else empty.
-        axes: Axes of this file that point up and to the front, as ("z", "-y"); None where they are
-            those of its collection.
+            names; empty without a catalogue.
+        axes: Axes of this file that point up and to the front, as ("z", "-y"); None for the axes of
+            its collection.
     """
 
     name: str
@@ -103,7 +103,7 @@ def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
 
 
 class _Walked(NamedTuple):
-    """What a folder holds.
+    """Names of the entries of a folder.
 
     Attributes:
         files: All files that are not hidden.
@@ -130,7 +130,7 @@ def _walk(folder: Path) -> _Walked:
 
 
 def passed_over(path: str | os.PathLike[str]) -> Counter[str]:
-    """What a folder holds that may be meshes, but is not read: how often each suffix comes.
+    """Files that may be meshes but are not read: their number for each suffix.
 
     Args:
         path: A folder; nothing is passed over in a file.
@@ -198,7 +198,8 @@ def _safe(path: str) -> str:
 def _catalogue(archive: zipfile.ZipFile) -> dict[str, dict[str, str]]:
     """Return the fields of each member that a Sweet Home 3D furniture catalogue describes.
 
-    Lines read `name#12=Oak chair`: field, entry, value. Fields with no entry are of all of them.
+    Lines read `name#12=Oak chair`: field, entry, value. Fields without an entry apply to all
+    entries.
     """
     content = _read_member(archive, _CATALOGUE)
     try:
@@ -224,16 +225,16 @@ def _catalogue(archive: zipfile.ZipFile) -> dict[str, dict[str, str]]:
     }
 
 
-def read_bytes(source: MeshSource, beside: str | None = None) -> bytes:
-    """The content of the file of a mesh, or of a file beside it.
+def read_bytes(source: MeshSource, relative: str | None = None) -> bytes:
+    """The content of the file of a mesh, or of a file next to it.
 
     Args:
         source: The mesh.
-        beside: Path of the other file, relative to the folder of the mesh; None for the mesh
+        relative: Path of the other file, relative to the folder of the mesh; None for the mesh
             itself.
 
     Raises:
-        ValueError: `beside` leaves the folder or the archive.
+        ValueError: `relative` leaves the folder or the archive.
         TooLarge: The file is larger than `MAX_BYTES`.
     """
     path = Path(source.path)
@@ -243,21 +244,21 @@ def read_bytes(source: MeshSource, beside: str | None = None) -> bytes:
     if source.member is None and path.suffix.lower() in ARCHIVE_SUFFIXES:
         raise zipfile.BadZipFile(f"{path.name} is not a readable zip archive.")
     if source.member is None:
-        file = path if beside is None else path.parent / _below(beside)
+        file = path if relative is None else path.parent / _below(relative)
         if not file.is_file():  # a device or a pipe could be read for ever
-            raise FileNotFoundError(f"There is no file {file.name!r} beside the mesh.")
+            raise FileNotFoundError(f"There is no file {file.name!r} next to the mesh.")
         with open(file, "rb") as stream:
             return _read(stream.read, file.name)
     member = source.member
-    if beside is not None:
-        member = _below(posixpath.join(posixpath.dirname(member), beside))
+    if relative is not None:
+        member = _below(posixpath.join(posixpath.dirname(member), relative))
     about = path.stat()
     return _read_member(_archive(source.path, about.st_mtime_ns, about.st_size), member)
 
 
 @lru_cache(maxsize=4)
 def _archive(path: str, modified: int, size: int) -> zipfile.ZipFile:
-    """An open archive; listing the members of a large one anew for each of them takes minutes."""
+    """An open archive; listing the members of a large one again for each member takes minutes."""
     del modified, size  # another file at the same path is opened anew
     return zipfile.ZipFile(path)
 
@@ -275,15 +276,16 @@ def _below(name: str) -> str:
 
 
 def _read(read: Callable[[int], bytes], name: str) -> bytes:
-    """Read to the end, but stop at the limit, whatever length a header promises."""
+    """Read to the end, but stop at the limit; the length in a header is not trusted."""
     content = read(MAX_BYTES + 1)
     if len(content) > MAX_BYTES:
         raise TooLarge(f"{name!r} is larger than {MAX_BYTES // 2**20} MiB.")
     return content
 
 
-class Beside(Resolver):
-    """Finds the files a mesh refers to, such as a glTF file's buffers, but never its pictures."""
+class RelativeFiles(Resolver):
+    """Reads the files that a mesh refers to, such as a glTF file's buffers, but never its
+    pictures."""
 
     def __init__(self, source: MeshSource):
         self._read: Callable[[str], bytes] = lambda name: read_bytes(source, name)
@@ -297,5 +299,5 @@ class Beside(Resolver):
     def write(self, name: str, data: bytes) -> None:
         raise NotImplementedError("Meshes are only read here.")
 
-    def namespaced(self, namespace: str) -> "Beside":
+    def namespaced(self, namespace: str) -> "RelativeFiles":
         raise NotImplementedError("Meshes are read with names relative to their own folder.")

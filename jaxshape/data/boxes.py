@@ -28,7 +28,7 @@ class Box(NamedTuple):
 
 
 def points_in_box(points: Float[np.ndarray, "*batch 3"], box: Box) -> Bool[np.ndarray, "*batch"]:
-    """Whether points lie in the box and in none of those it excludes.
+    """Whether points lie in the box and in none of the boxes it excludes.
 
     Args:
         points: Points in the world `[*batch 3]`, in metres.
@@ -125,7 +125,7 @@ def _level_box(content: dict[str, Any], path: str | Path) -> Box:
 
 
 def _level_frame(content: dict[str, Any], path: str | Path) -> Float[np.ndarray, "4 4"]:
-    """World to level, a rigid motion that may mirror, as that of the known files does."""
+    """World to level: a rigid motion that may mirror, as it does in the known files."""
     T = _numbers(content, "world_to_level", (4, 4), path)
     mirrored = np.diag([1.0, 1.0, np.sign(np.linalg.det(T[:3, :3])) or 1.0, 1.0])
     check_rigid(mirrored @ T, f"world_to_level of {path}")
@@ -137,7 +137,8 @@ _COMPARISON = re.compile(r"\s*([XYh])\s*([<>])\s*(-?\d+(?:\.\d+)?)\s*")
 
 
 def _level_rule(rule: str, path: str | Path) -> Float[np.ndarray, "2 3"]:
-    """The corners, in the level frame, of what a rule like `X > -0.96 and h > 0.62` excludes."""
+    """The corners, in the level frame, of the box that a rule like `X > -0.96 and h > 0.62`
+    excludes."""
     if len(rule) > limits.PATH_LENGTH:
         raise SequenceError(f"{path} gives {len(rule)} characters as exclude_level; shorten it.")
     corners = np.array([[-_FAR] * 3, [_FAR] * 3])

@@ -45,7 +45,7 @@ class BuildProgress(NamedTuple):
         objects: Objects that are done, skipped ones included.
         total: Objects in all.
         skipped: Objects that could not be used.
-        notes: Names of objects, and what their files held besides.
+        notes: Names of objects, and notes on other things in their files.
     """
 
     objects: int
@@ -67,12 +67,12 @@ class BuildProgress(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What became of one object.
+    """The result of one object.
 
     Attributes:
         name: Its name.
         content: Digest of its file; empty for a procedural object.
-        notes: What its file held besides.
+        notes: Notes on other things in its file.
         skipped: Why it could not be used; None where it could.
     """
 
@@ -91,7 +91,7 @@ def build_dataset(
 ) -> Iterator[BuildProgress]:
     """Make the missing objects of a dataset in parallel processes.
 
-    A shard with an object whose file has changed since is made anew.
+    A shard is made again if the file of one of its objects has changed.
 
     Args:
         folder: Folder of the dataset; made if missing.
@@ -164,7 +164,7 @@ def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> No
     if not path.exists():
         return write_json(path, claim)
     found = json.loads(path.read_text())
-    # Datasets of before there was a setting have what is its default now.
+    # Older datasets lack newer settings; they were made with the present defaults.
     known = {"config": json.loads(json.dumps(asdict(DatasetConfig()))) | found.get("config", {})}
     if found | known != claim:
         raise DatasetError(
@@ -247,7 +247,7 @@ def _write_shard(
 def _finished(
     folder: Path, shard: int, items: Sequence[Object]
 ) -> tuple[list[Skipped], list[tuple[str, str]]] | None:
-    """What was skipped of a shard, and its notes; None where it is to be made."""
+    """The skipped objects and the notes of a shard; None where it has to be made."""
     path = shard_path(folder, shard, "json")
     if not path.exists():
         return None

@@ -20,9 +20,9 @@ class CameraConfig:
             of an iPhone (256 x 192), or the paper's square images of 96 pixels.
         noise: Give depth images the faults of the camera's sensor; None for all but the paper's
             camera.
-        fusion: How frames become F and M: `distance` averages signed distances on a fine grid,
-            `points` counts points in voxels (paper); None for points where the paper's camera has
-            no noise, distances elsewhere.
+        fusion: Method that turns frames into F and M: `distance` averages signed distances on a
+            fine grid, `points` counts points in voxels (paper); None for points where the paper's
+            camera has no noise, distances elsewhere.
 
     Raises:
         ValueError: A setting is none of these.
@@ -44,6 +44,6 @@ class CameraConfig:
 
     @property
     def fused_by(self) -> FusionName:
-        """How frames are fused."""
+        """Method that fuses frames."""
         clean = self.camera == "paper" and not self.is_noisy
         return self.fusion or ("points" if clean else "distance")

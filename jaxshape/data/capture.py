@@ -24,7 +24,7 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
 
 SURFACE_SAMPLES = 50_000
-"""Points sampled on a CAD model to find its surface voxels: some 15 for each of them."""
+"""Points sampled on a CAD model to find its surface voxels: about 15 for each voxel."""
 
 PAPER = CAMERAS["paper"]
 
@@ -149,7 +149,7 @@ def measure_frames(captured: Capture) -> Measurement:
 
 
 def sensor_of(camera: VirtualCamera) -> Sensor:
-    """How well a camera measures depth: its noise, and the steps in which depths come.
+    """Depth noise of a camera, including its quantisation.
 
     Args:
         camera: The camera whose frames are fused.
@@ -171,7 +171,7 @@ def fused_grids(
         captured: Depth frames of an object, from `capture`.
         fusing: The way to fuse them.
         numbers: Increasing numbers of frames, 1 or more each.
-        sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
+        sensor: Noise of the camera (`sensor_of`); the first Kinect's by default.
 
     Returns:
         Grids `[len(numbers) x y z]`.
@@ -183,7 +183,7 @@ def fused_grids(
 def _stages(
     captured: Capture, fusing: Fusion, numbers: tuple[int, ...], sensor: Sensor
 ) -> Iterator[Any]:
-    """States of the first frames of a capture, of which every pixel that hit shows the object."""
+    """States of the first frames of a capture; every pixel that hit something shows the object."""
     depth, T = jnp.asarray(captured.depth), captured.T_object_camera
     seen, intrinsics = jnp.isfinite(depth), captured.intrinsics
     return fuse_in_stages(fusing, numbers, depth, seen, intrinsics, T, captured.frame, sensor)
@@ -196,7 +196,7 @@ def fused_frames(captured: Capture, fusing: Fusion, sensor: Sensor = Sensor()) -
     Args:
         captured: Depth frames of an object, from `capture`.
         fusing: The way to fuse them.
-        sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
+        sensor: Noise of the camera (`sensor_of`); the first Kinect's by default.
     """
     (state,) = _stages(captured, fusing, (len(captured.depth),), sensor)
     return state, fusing.grids(state)
@@ -207,13 +207,13 @@ def fuse_frames(
 ) -> DistanceField:
     """Signed distances fused from the first k frames, for each k of an increasing tuple.
 
-    Frames are added one at a time, so that one field at a time is in memory, besides those asked
-    for; every pixel that hit something shows the object.
+    Frames are added one at a time, so that memory holds one field and the returned ones; every
+    pixel that hit something shows the object.
 
     Args:
         captured: Depth frames of an object, from `capture`.
         frames: Increasing numbers of frames, 1 or more each.
-        sensor: Exactness of the camera (`sensor_of`); that of the first Kinect by default.
+        sensor: Noise of the camera (`sensor_of`); the first Kinect's by default.
 
     Returns:
         One field for each number of frames `[len(frames) n n n]`.

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from jaxshape.data.archives import Beside, MeshSource, read_bytes
+from jaxshape.data.archives import MeshSource, RelativeFiles, read_bytes
 from jaxshape.data.formats.parts import MAX_FACES
 from jaxshape.data.meshes import sample_oriented
 from jaxshape.data.pcd import parse_pcd
@@ -29,8 +29,7 @@ class Cloud(NamedTuple):
     Attributes:
         points: The points `[n 3]`.
         normals: Directions out of the surface `[n 3]`, of length 1; None where they are not known.
-        sensor: Where the sensor was, from which all points were seen `[3]`; None where that is not
-            known.
+        sensor: Position of the sensor that saw all points `[3]`; None where that is not known.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -42,7 +41,7 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
     """Read a point cloud or a fused model.
 
     A model of triangles gives points all over its surface, with its normals. Points that are not
-    finite are left out, and normals where one of them has no length.
+    finite are left out; all normals are dropped if one of them has no length.
 
     Args:
         path: A `.ply` or `.pcd` file.
@@ -81,7 +80,7 @@ def _read_ply(content: bytes, path: Path, seed: int) -> Cloud:
     loaded: Any = trimesh.load(
         io.BytesIO(content),
         file_type="ply",
-        resolver=Beside(MeshSource(path.stem, str(path))),
+        resolver=RelativeFiles(MeshSource(path.stem, str(path))),
         process=False,
         skip_materials=True,
     )

@@ -34,7 +34,7 @@ def check_axes(up: str, front: str) -> None:
         front: Axis along which the object's front looks.
 
     Raises:
-        ValueError: One of them is no axis, or both lie on one line.
+        ValueError: An argument is no axis, or both lie on one line.
     """
     checks.one_of("up", up, get_args(Axis))
     checks.one_of("front", front, get_args(Axis))
@@ -46,7 +46,7 @@ def check_axes(up: str, front: str) -> None:
 
 @dataclass(frozen=True)
 class FaultConfig:
-    """How often real frames go wrong in training, each a share from 0 to 1.
+    """Rates of the faults of real frames in training, each a share from 0 to 1.
 
     Attributes:
         pose_error: Share of the frames whose pose is off by about a centimetre and half a degree.
@@ -84,15 +84,15 @@ class DatasetConfig:
     Attributes:
         paths: Camera paths about each object, 1 or more. Each draws its own camera, views, noise
             and faults.
-        frames: Increasing numbers of frames, 1 or more each: what was measured after so many frames
-            of each path becomes a training input.
+        frames: Increasing numbers of frames, 1 or more each: the measurement after each number of
+            frames of a path becomes a training input.
         cameras: Names of the depth cameras of which each path draws one: "paper", "kinect",
-            "realsense", "iphone-lidar". Frames of the paper's are fused as points, others as signed
-            distances.
+            "realsense", "iphone-lidar". Frames of the paper's camera are fused as points, others as
+            signed distances.
         noisy: Share of the paths whose depth images get the faults of their sensor, from 0 to 1.
         arcs: Share of the paths along an arc about the object, from 0 to 1; the others draw random
             views as in the paper.
-        faults: How often frames go wrong.
+        faults: Rates of the faults of real frames.
         up: Axis of the mesh files that points up.
         front: Axis of the mesh files along which the object's front looks.
         unit: Unit of the mesh files: "m", "cm", "mm" or "inch".
@@ -140,12 +140,12 @@ DATASETS = {
         paths=18, frames=(1,), cameras=("paper",), noisy=0.0, arcs=0.0, faults=FAULTLESS
     ),
 }
-"""Datasets by name: what we found best, and the paper's own."""
+"""Datasets by name: our best, and the paper's own."""
 
 
 @dataclass(frozen=True)
 class InputConfig:
-    """How training inputs are drawn from a dataset.
+    """Settings by which training inputs are drawn from a dataset.
 
     Attributes:
         complete: Share of the inputs that are the complete surface itself, from 0 to 1.

@@ -1,12 +1,12 @@
-"""Training pairs on disk: what was measured of many objects, and their complete surfaces. [host]
+"""Training pairs on disk: measurements of many objects, and their complete surfaces. [host]
 
-A dataset is a folder of shards of up to `OBJECTS_PER_SHARD` objects. Of each object a shard holds
-the complete surface **Y** along each camera path, in bit-packed grids `[object path bytes]`, and
-what was measured after each number of frames, `[object path number voxels]`: one byte for each
-voxel, of which 4 bits are the probability of surface and 4 that of free space, in fifteenths. A
-`.json` beside it names the objects, what was skipped, and the content of the files.
+A dataset is a folder of shards of up to `OBJECTS_PER_SHARD` objects. For each object and camera
+path, a shard holds the complete surface **Y** in bit-packed grids `[object path bytes]`, and the
+measurement after each number of frames, `[object path number voxels]`. A voxel takes one byte: 4
+bits for the probability of surface and 4 for the probability of free space, in fifteenths. A
+`.json` file of the same name lists the objects, the skipped ones, and digests of their files.
 
-`building` makes datasets; here is what one object becomes, and how a finished dataset is read.
+`building` makes datasets; this module packs the pairs of one object and reads finished datasets.
 """
 
 import os
@@ -35,10 +35,10 @@ KINDS = ("surface", "measured")
 OBJECTS_PER_SHARD = 64
 
 STEPS = 15
-"""Steps of the probabilities of what was measured, which have 4 bits each."""
+"""Steps of the measured probabilities, which have 4 bits each."""
 
 ATTEMPTS = 3
-"""How often a path is drawn along which nothing is measured."""
+"""Number of times that a path is drawn if nothing is measured along it."""
 
 Object = Procedural | MeshSource
 """An object of a dataset: a procedural one, or a mesh file."""
@@ -63,8 +63,8 @@ def load_object(
 def object_paths(
     mesh: trimesh.Trimesh, config: DatasetConfig, seed: int
 ) -> tuple[UInt8[np.ndarray, "path bytes"], UInt8[np.ndarray, "path number voxels"]] | None:
-    """The complete surface of one object and what was measured of it along each path, packed; None
-    where a camera measures nothing of it along a whole path, however often that is drawn."""
+    """The complete surface and the measurements of one object along each path, packed; None where a
+    camera measures nothing along a whole path in `ATTEMPTS` draws."""
     drawn = [_drawn(mesh, config, (seed, i)) for i in range(config.paths)]
     paths = [path for path in drawn if path is not None]
     if len(paths) < len(drawn):
@@ -161,7 +161,7 @@ class Dataset(NamedTuple):
         return unpack(self.surfaces[shard][place, path])
 
     def inputs_of(self, index: int) -> tuple[int, int]:
-        """How many paths an object has, and how many measurements each."""
+        """Number of paths of an object, and of measurements of each path."""
         return self.measured[self.row[index][0]].shape[1:3]
 
     def grids(self, index: int, path: int, number: int) -> Grids:

@@ -9,7 +9,7 @@ from jaxshape.data.config import FamilyName
 from jaxshape.data.tables import random_table
 
 FAMILIES = {"chair": random_chair, "table": random_table}
-"""What makes the object of a seed, for each family."""
+"""The function that makes the object of a seed, for each family."""
 
 TEST_SEEDS = 1_000_000
 """Procedural objects from this seed on are for tests; training uses smaller ones."""
@@ -20,7 +20,7 @@ class Procedural(NamedTuple):
 
     Attributes:
         family: Name of its family: "chair", "table".
-        seed: Its seed, 0 or more.
+        seed: Seed of the object, 0 or more.
     """
 
     family: FamilyName

@@ -1,6 +1,6 @@
-"""What goes wrong in real depth frames, for training: each fault in its share of frames. [host]
+"""Faults of real depth frames, for training: each in its share of the frames. [host]
 
-They act on images and poses, as in a recording, so that whatever fuses the frames meets them.
+They act on images and poses, as in a recording, so that every way of fusing frames meets them.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Parts of a file that stand beside the object: colliders, shadows, and the ground below it."""
+"""Parts of a mesh file that are not the object: colliders, shadows, and the ground below it."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -29,7 +29,8 @@ def without_helpers(parts: Sequence[Part], up: str = "y") -> tuple[list[Part], t
         up: Axis of the file that points up, as "y" or "-z".
 
     Returns:
-        The parts that are left; all of them where none would be. What was left out.
+        The remaining parts; all parts if none would remain. Sentences on the parts that were left
+        out.
     """
     left, notes = [part for part in parts if len(part.faces)], []
     for kind, named in (("collider", _COLLIDER), ("shadow", _SHADOW), ("ground", _GROUND)):

@@ -14,12 +14,12 @@ KNOTS = 5
 def draw_pair(
     dataset: Dataset, index: int, config: InputConfig, rng: np.random.Generator
 ) -> tuple[Grids, Bool[np.ndarray, "x y z"]]:
-    """What was measured of an object, and its complete surface.
+    """A measurement of an object, and its complete surface.
 
     Args:
         dataset: The dataset.
         index: Number of the object.
-        config: How the input is drawn.
+        config: Settings of the draw.
         rng: Random generator of the draws.
 
     Returns:
@@ -44,8 +44,8 @@ def warped(
 ) -> tuple[Grids, Bool[np.ndarray, "x y z"]]:
     """The pair with other proportions: each axis by a random map that keeps both of its ends.
 
-    Where layers are squeezed into one, it is surface if any of them is, and free if all are, so
-    that no surface gets holes.
+    Where several layers become one, a voxel is surface if it was in any of them, and free if it was
+    in all, so that no surface gets holes.
     """
     known = 1 - grids.occluded
     seen, free = grids.occupied * known, (1 - grids.occupied) * known
@@ -59,7 +59,7 @@ def warped(
 
 
 def source_layers(count: int, share: float, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
-    """The first layer of those that become each layer, by steps of 1 plus or minus `share`.
+    """The first source layer of each new layer, by steps of 1 plus or minus `share`.
 
     `reduceat` takes the layers up to the next entry, or the layer itself where the next is the
     same.

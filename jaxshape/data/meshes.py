@@ -45,9 +45,10 @@ class Model(NamedTuple):
         mesh: Triangles only, +y up, front along +z, bounding box centred at the origin, in the
             units of the file (metres where the file is in metres, as glTF is, or where a catalogue
             gives sizes).
-        metadata: Entries of a furniture catalogue: name, creator, license, and so on; else empty.
-        notes: Sentences on what the file holds besides the object, and was left out.
-        digest: Digest of the content of the file, and of what it refers to.
+        metadata: Entries of a furniture catalogue: name, creator, license, and so on; empty without
+            a catalogue.
+        notes: Sentences on parts of the file that are not the object and were left out.
+        digest: Digest of the content of the file and of the files that it refers to.
     """
 
     name: str
@@ -65,7 +66,7 @@ class Skipped(NamedTuple):
         reason: One of `unreadable`, `not supported` (a feature of the format), `too large`, `empty`
             (no vertices), `no faces` (none with an area), `not finite`, `flat` (an axis with no
             extent), `nothing measured` (by the virtual camera), `killed` (with its process).
-        detail: A sentence on what is wrong.
+        detail: A sentence that describes the problem.
     """
 
     name: str
@@ -107,7 +108,7 @@ def load(
 ) -> Model | Skipped:
     """Load one mesh, flattened and turned so that `up` becomes +y and `front` becomes +z. [host]
 
-    Materials, pictures and what stands beside the object (`helpers`) are left out. Where a
+    Materials, pictures and parts that are not the object (`helpers`) are left out. Where a
     furniture catalogue describes the mesh, its rotation and its size in centimetres are applied
     first, as Sweet Home 3D does.
 
@@ -147,7 +148,7 @@ def load(
 
 
 def _parse(source: MeshSource, up: str) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
-    """All triangles of a file as one mesh, and what was left out."""
+    """All triangles of a file as one mesh, and sentences on the parts that were left out."""
     content = read_bytes(source)
     if not content.strip(b"\0 \t\r\n"):
         raise _Unusable("empty", "The file has no content.")
@@ -191,7 +192,8 @@ def _usable(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
 
 
 def digest(source: MeshSource) -> str:
-    """A digest of all that decides the shape in a file, whatever the file's name and place are.
+    """A digest of everything that decides the shape in a file, but not of the file's name and
+    place.
 
     Args:
         source: The mesh. Files that it refers to and that are missing count as empty.
@@ -199,7 +201,7 @@ def digest(source: MeshSource) -> str:
     content = read_bytes(source)
     found = hashlib.sha256(content)
     for name in referred(content):
-        with suppress(Exception):  # what is missing or broken is reported by whoever needs it
+        with suppress(Exception):  # missing or broken files are reported when they are read
             found.update(read_bytes(source, name))
     about = sorted(source.metadata.items()), source.axes
     found.update(repr(about).encode("utf-8", "surrogateescape"))
@@ -244,8 +246,8 @@ def in_metres(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         mesh: A mesh in any unit, its box centred at the origin.
 
     Returns:
-        The mesh itself where its diagonal is that of something in a room, if taken for metres;
-        else the mesh scaled to a diagonal of 1 m.
+        The mesh itself if its diagonal in metres fits something in a room; otherwise the mesh
+        scaled to a diagonal of 1 m.
     """
     if SMALLEST <= mesh.scale <= LARGEST:
         return mesh

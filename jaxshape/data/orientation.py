@@ -68,7 +68,7 @@ def _asymmetry(
 
 
 def _spread(across: Float[np.ndarray, "n 2"], chosen: Bool[np.ndarray, " n"]) -> float:
-    """Area that the chosen points span, as a fraction of what all points span."""
+    """Area that the chosen points span, as a fraction of the area that all points span."""
     return _hull_area(across[chosen]) / _hull_area(across)
 
 

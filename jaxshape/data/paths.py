@@ -1,7 +1,7 @@
 """One training path: a camera moves about an object, and its frames are fused as they come. [host]
 
-Each path draws its own camera, poses, noise and faults. What was measured after some numbers of
-frames becomes the training inputs.
+Each path draws its own camera, poses, noise and faults. The measurements after some numbers of
+frames become the training inputs.
 """
 
 from functools import partial
@@ -32,14 +32,14 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
 
 NEAREST, FARTHEST = 0.8, 1.3
-"""Distances of the cameras of a path, in those of their kind."""
+"""Distances of the cameras of a path, relative to the usual distance of their kind."""
 
 IMAGE_STEP = 64
 """Images grow in steps of so many pixels, so that few compiled programs serve for all."""
 
 
 class Path(NamedTuple):
-    """What training gets of one path.
+    """Training input and target of one path.
 
     Attributes:
         surface: The true surface **Y** `[x y z]`.
@@ -55,7 +55,7 @@ def draw_path(mesh: trimesh.Trimesh, config: DatasetConfig, seed: int) -> Path:
 
     Args:
         mesh: A mesh in the canonical object frame.
-        config: What is drawn, and how often.
+        config: Settings of the draws.
         seed: Seed of all draws, 0 or more.
     """
     rng = np.random.default_rng(seed)

@@ -16,8 +16,8 @@ class Columns(NamedTuple):
 
     Attributes:
         values: The numbers of each field `[n]`, by its name.
-        viewpoint: Where the sensor was `[3]`; None where the file does not say, as it does not with
-            the default, the origin.
+        viewpoint: Position of the sensor `[3]`; None where the file does not say, as it does not
+            with the default, the origin.
     """
 
     values: dict[str, Float[np.ndarray, " n"]]
@@ -138,7 +138,7 @@ def _unpacked(body: bytes, size: int) -> bytes:
         if first < 0:
             raise ValueError("its block refers to bytes before its start")
         part = bytes(out[first : first + length + 2])
-        # A reference may reach into what it is about to write, and then repeats.
+        # A reference may overlap the bytes that it writes; it then repeats them.
         out += (part * (-(-(length + 2) // len(part))))[: length + 2]
     if len(out) != size:
         raise ValueError(f"its block unpacks to {len(out)} bytes; expected {size}")

@@ -3,8 +3,8 @@
     for number, result in in_processes(function, items, workers=8):
         ...                                     # `Died` for an item that kills its process twice
 
-An item is what one process does at a time: a process that dies loses one item, which is tried once
-more at the end, alone, for memory may have run out.
+A process works on one item at a time. A process that dies loses its item, which is tried once more
+at the end, alone, since memory may have run out.
 """
 
 import os
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 
 class Died(NamedTuple):
-    """What stands for the result of an item that ended its process twice.
+    """The result of an item that killed its process twice.
 
     Attributes:
         code: Exit status of the process; -9 where signal 9 killed it.
@@ -68,8 +68,9 @@ def in_processes(
     """Results of a function of each item, as they come.
 
     Args:
-        function: Importable, as are its argument and result; what it raises is raised here.
-        items: Its arguments.
+        function: Importable and picklable, as are its argument and result; its errors are raised
+            here.
+        items: Arguments of the function.
         workers: Number of processes, 1 or more; 1 works in this process.
 
     Yields:
@@ -110,7 +111,7 @@ def in_processes(
 def _share_out(
     crew: list[_Worker], items: Sequence[Any], waiting: deque[int], again: deque[int]
 ) -> None:
-    """Give items to the processes that have none; those that killed a process, one at a time."""
+    """Give items to idle processes; items that killed a process are tried one at a time."""
     for worker in crew:
         if not worker.is_ready or worker.number is not None:
             continue
@@ -161,7 +162,7 @@ class _Raised(NamedTuple):
     """The answer of a process whose function raised.
 
     Attributes:
-        problem: What the function raised.
+        problem: The error that the function raised.
     """
 
     problem: Exception
@@ -172,7 +173,7 @@ class _Raised(NamedTuple):
 
 def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:
     """The life of a process: an item in, a result out, until the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and ends this process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this process
     threading.Thread(target=_die_with_parent, daemon=True).start()
     pipe.send(None)
     while True:

@@ -1,7 +1,7 @@
-"""The virtual depth camera of the paper (section 2.3), and what a real one adds to it. [host]
+"""The virtual depth camera of the paper (section 2.3), and the noise of a real one. [host]
 
-Each pixel casts one ray through its centre; the first triangle it meets hides all others, and the
-depth is that of the ray's intersection with the plane of that triangle.
+Each pixel casts one ray through its centre. The first triangle it meets hides all others; the depth
+is that of the point where the ray intersects the plane of that triangle.
 """
 
 import jax.numpy as jnp
@@ -39,16 +39,15 @@ def window(
 ) -> tuple[Intrinsics, tuple[int, int]]:
     """The part of a camera's images that can show a mesh, the same for all views.
 
-    It holds the sphere around the mesh: rays outside meet nothing, so that nobody need cast them or
-    keep their pixels. Cameras that look at the centre from the distance of their kind have the same
-    window whatever the mesh is, and compiled programs serve for all.
+    It holds the sphere around the mesh: rays outside meet nothing, so that they are not cast and
+    their pixels not kept. The window of cameras that look at the centre from the usual distance of
+    their kind is the same for all meshes, so that a compiled program serves all of them.
 
     Args:
-        camera: Its whole image is kept where its lens is fitted to the mesh.
-        mesh: In the object frame, metres.
+        camera: The camera. Its whole image is kept where its lens is fitted to the mesh.
+        mesh: The mesh in the object frame, in metres.
         T_object_camera: One pose per view.
-        margin: By how much the sphere is larger than the one around the mesh's bounding box, as a
-            share of its radius.
+        margin: Margin of the sphere around the mesh's bounding box, as a share of its radius.
 
     Returns:
         Intrinsics whose principal point counts from the window's corner, and the window's height
@@ -134,11 +133,12 @@ def _may_hit(
     intrinsics: Intrinsics,
     size: tuple[int, int],
 ) -> Bool[np.ndarray, "views h w"]:
-    """Pixels in tiles that some triangle may touch: all that can hit, and few others."""
+    """Pixels in tiles that a triangle may touch: all pixels that can hit the mesh, and few
+    others."""
     rows, columns = -(-size[0] // TILE), -(-size[1] // TILE)
     points = (mesh.vertices - poses[:, None, :3, 3]) @ poses[:, :3, :3]
     depth = points[..., 2]
-    behind = np.asarray((depth <= 0).any(axis=1))  # such a mesh may be anywhere
+    behind = np.asarray((depth <= 0).any(axis=1))  # part of the mesh lies behind the camera
     fx, fy, cx, cy = (float(x) for x in intrinsics)
     pixels = points[..., :2] * (fx, fy) / np.where(depth > 0, depth, 1)[..., None] + (cx, cy)
     left, right = _ends(pixels[..., 0], mesh.faces, columns)
@@ -169,7 +169,7 @@ def _cover(
 ) -> Bool[np.ndarray, "views rows columns"]:
     """Tiles inside any of the rectangles of their view.
 
-    A rectangle changes four entries of a difference image, whose sums along both axes count the
+    A rectangle changes four entries of a difference image; its sums along both axes count the
     rectangles over each tile.
     """
     rows, columns = shape[0] + 1, shape[1] + 1
@@ -193,7 +193,7 @@ def add_sensor_noise(
     rng: np.random.Generator,
     noise: SensorNoise = SensorNoise(),
 ) -> Float[np.ndarray, "views h w"]:
-    """What a real sensor would have reported; lost pixels become 0, nothing known."""
+    """The depths that a real sensor would have reported; lost pixels become 0, nothing known."""
     noisy, (h, w) = depth.copy(), depth.shape[1:]
     flat, rows = noisy.reshape(-1), np.arange(len(depth)) * h
     # Only edges show jitter across the image; elsewhere it would act as axial noise.

@@ -1,4 +1,4 @@
-"""The meshes of a collection that are kept out of training, by what they are. [host]"""
+"""The meshes of a collection that are kept out of training, chosen by their shapes. [host]"""
 
 import hashlib
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[MeshSou
         meshes: Meshes of the collection, of which two or more are usable and differ.
 
     Returns:
-        The meshes to train on, those that cannot be used among them, and those held out.
+        The meshes to train on, including unusable ones, and the held-out meshes.
 
     Raises:
         ValueError: There are fewer than two different meshes.
@@ -60,7 +60,7 @@ def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[MeshSou
 
 
 def same_shapes(meshes: Sequence[Surveyed]) -> list[int]:
-    """A number for each mesh, the same for those of the same shape.
+    """A number for each mesh, equal for meshes of the same shape.
 
     Args:
         meshes: Meshes that can be used.

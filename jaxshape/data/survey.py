@@ -1,7 +1,7 @@
-"""What is to be known of many meshes before anything is made of them, in parallel. [host]
+"""A survey of many meshes before any of them is used, in parallel. [host]
 
-Sizes tell the unit, shapes tell duplicates whatever their format, and seats tell the axis that
-points up. No geometry is kept.
+Sizes tell the unit, shapes tell duplicates in any format, and seats tell the axis that points up.
+No geometry is kept.
 """
 
 import os
@@ -25,10 +25,10 @@ IN_A_PROCESS = 8
 
 
 class Surveyed(NamedTuple):
-    """What is known of a mesh.
+    """Size, shape and stance of a mesh.
 
     Attributes:
-        source: Where it is.
+        source: The mesh file.
         size: Diagonal of its box, in metres if the unit is right; 0 where it cannot be used.
         signature: Numbers that tell its shape, see `signature_of`; empty where it cannot be used.
         lies: Whether it is a seat that seems to lie on its side.
@@ -60,7 +60,7 @@ def survey(
         workers: Processes, 1 or more; None for one for each CPU core.
 
     Yields:
-        The number of a mesh in `sources`, and what is known of it, as they come.
+        The number of a mesh in `sources`, and its survey, in the order in which they finish.
     """
     workers = workers or os.cpu_count() or 1
     if len(sources) < IN_A_PROCESS:
@@ -118,14 +118,14 @@ def signature_of(mesh: trimesh.Trimesh) -> tuple[float, ...]:
 
 
 def doubted_size(sizes: Sequence[float], unit: UnitName) -> str | None:
-    """A sentence on the unit of a collection that has the size of nothing in a room.
+    """A sentence on the unit of a collection, if its sizes fit nothing in a room.
 
     Args:
         sizes: Diagonals of its meshes, in metres if the unit is right.
         unit: The unit that they were read with.
 
     Returns:
-        What is wrong and what to do; None where nothing is.
+        A sentence with the problem and a remedy; None without a problem.
     """
     median = float(np.median(sizes)) if len(sizes) else 1.0
     low, high = PLAUSIBLE
@@ -142,11 +142,11 @@ def doubted_size(sizes: Sequence[float], unit: UnitName) -> str | None:
 
 
 def evenly(sources: Sequence[MeshSource], count: int) -> list[MeshSource]:
-    """Some of the meshes, from all over the collection.
+    """Some of the meshes, spread evenly over the collection.
 
     Args:
         sources: All meshes.
-        count: How many of them at most, 1 or more.
+        count: Largest number of meshes, 1 or more.
     """
     chosen = np.unique(np.linspace(0, len(sources) - 1, min(count, len(sources))).astype(int))
     return [sources[i] for i in chosen]

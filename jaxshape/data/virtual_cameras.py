@@ -48,7 +48,7 @@ class VirtualCamera:
         height: Pixels along each column.
         field_of_view: Across the width, in degrees; None for the longest lens with which every
             view sees the whole object, as in the paper.
-        distance: From the camera to the object's centre, in diagonals of its bounding box.
+        distance: Distance of the camera from the object's centre, in diagonals of its bounding box.
         noise: The faults of its sensor, where noise is asked for.
 
     Raises:

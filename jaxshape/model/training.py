@@ -419,7 +419,7 @@ def _opened(checkpoint: Path) -> Iterator[Any]:
             yield file
     except (SafetensorError, OSError, ValueError) as problem:
         raise ValueError(
-            f"{str(checkpoint)!r} cannot be gone on with ({problem}); remove it to begin anew."
+            f"{str(checkpoint)!r} cannot be resumed ({problem}); remove it to start again."
         ) from problem
 
 

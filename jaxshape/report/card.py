@@ -1,4 +1,4 @@
-"""The model card of a training run: what the weights were made from, how, and how good they are.
+"""The model card of a training run: data, training and quality of the weights.
 
 A card is a dictionary, kept in the weights file and as JSON; `describe` writes it out in Markdown.
 """
@@ -49,8 +49,8 @@ def training_card(
         config: Settings of the run.
         metrics: Reports of the run.
         data: Description of the dataset, with its `source` and the number of objects `used`.
-        start: Weights that the run began with, whose own samples are counted under
-            `samples_before`; None for random ones.
+        start: Weights that the run began with (their own samples are counted under
+            `samples_before`); None for random ones.
         command: The command that started the run.
         licence: Licence of the weights.
     """
@@ -72,7 +72,7 @@ def training_card(
 def basis_card(
     config: TrainConfig, data: dict[str, Any], *, command: str, licence: str
 ) -> dict[str, Any]:
-    """The card of principal components; `data` is what `training_card` takes."""
+    """The card of principal components; `data` is the argument of `training_card`."""
     return {
         "model": "pca",
         "data": data,
@@ -143,7 +143,7 @@ def _model(card: dict[str, Any]) -> str:
     if card["model"] == COMPLETION.kind:
         channels = _chain(sizes["channels"])
         return (
-            f"a network conditioned on what was measured, {grids}, {channels} channels at a half, "
+            f"a network conditioned on the measurement, {grids}, {channels} channels at a half, "
             "a quarter\nand an eighth of the resolution"
         )
     encoder, decoder = _chain(sizes["encoder"]), _chain([*sizes["decoder"], 1])
@@ -172,7 +172,7 @@ def _paths(config: dict[str, Any]) -> str:
     frames = ", ".join(map(str, config["frames"]))
     return (
         f"{count} path{'s' * (count > 1)} by a camera ({', '.join(config['cameras'])}), "
-        f"{config['noisy']:.0%} with sensor noise; inputs are what {frames} frames measured"
+        f"{config['noisy']:.0%} with sensor noise; inputs are measurements of {frames} frames"
     )
 
 
@@ -210,9 +210,9 @@ folder; first k frames of an orbit at
 {markdown_table(scores["means"])}
 
 IoU, Chamfer-L1 (a fraction of the bounding-box diagonal) and F-score (at 1 % of the grid's side)
-are of the decoded shape; the composed one keeps what was measured and fills in only what was
-occluded. IoU occluded is of the occluded voxels alone, nats occluded their cross-entropy. F is the
-measurement alone, F or M the same with all that was occluded filled in. Single meshes are in
+are of the decoded shape; the composed shape keeps measured voxels and fills in only occluded ones.
+IoU occluded is the IoU in the occluded voxels alone, nats occluded their cross-entropy. F is the
+measurement alone, F or M the measurement with all occluded voxels filled. Single meshes are in
 evaluation.json."""
 
 
@@ -225,17 +225,17 @@ def _seen(config: dict[str, Any]) -> str:
 
 def _limits(card: dict[str, Any], scores: dict[str, Any] | None) -> Iterator[str]:
     yield (
-        "Knows objects like those it was trained on and no others: upright, front along +z, each "
-        "axis scaled\n  to fill the grid up to a voxel on each side. What is thinner than a voxel "
-        "merges with what is beside it."
+        "Knows only objects like its training objects: upright, front along +z, each axis scaled "
+        "to fill\n  the grid up to a voxel on each side. Parts thinner than a voxel merge with "
+        "their neighbours."
     )
     if scores is not None:
         yield (
-            "The figures are of meshes from the collection that was trained on, seen by a "
+            "The figures are for meshes from the training collection, seen by a "
             "simulated camera with\n  exact poses. Other objects, and real frames, will do worse."
         )
     if card["data"]["used"] < FEW:
         yield (
-            f"{card['data']['used']} objects are few: expect it to remember them rather than to "
-            "know the kind."
+            f"{card['data']['used']} objects are few: the network may memorise them rather than "
+            "learn the category."
         )

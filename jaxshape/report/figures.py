@@ -1,4 +1,4 @@
-"""What all plots share: a tidy look, and files that are the same for the same drawing. [host]"""
+"""The common style of all plots, and reproducible files. [host]"""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Requests to the live view that are answered: those of its own page, at an address of its own.
+"""The live view answers only requests of its own page, at one of its own addresses.
 
 A browser sends a page from anywhere to 127.0.0.1, too. The name that it was given for the machine
 (`Host`) and the page that asks (`Origin`) tell such requests from those of the view. [host]
@@ -48,7 +48,7 @@ def _own_names() -> tuple[str, ...]:
 
 
 def _is_address(name: str) -> bool:
-    """Whether a host is named by its number, which nobody else can make point here."""
+    """Whether a host is given by its number; a foreign name cannot point to a number."""
     try:
         ipaddress.ip_address(name)
     except ValueError:

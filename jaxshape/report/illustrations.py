@@ -35,7 +35,7 @@ class Picture(NamedTuple):
     Attributes:
         title: Text above the picture.
         uri: The picture as a data URI.
-        description: Text for those who cannot see it.
+        description: Text for readers who cannot see the picture.
         note: Text below the picture.
     """
 
@@ -149,7 +149,7 @@ def grids(found: ResultFolder) -> list[Picture]:
 
 
 def _grid_panel(title: str, name: str, have: dict[str, Any], note: str) -> Panel:
-    """A predicted grid; of the composed one, what was measured is blue."""
+    """A predicted grid; measured voxels of the composed grid are blue."""
     if name == "composed" and "occupied" in have:
         labels = np.where(have["occupied"], 1, 2 * have["composed"])
         return grid_panel(title, labels, "measured", "predicted", note=note)
@@ -157,7 +157,7 @@ def _grid_panel(title: str, name: str, have: dict[str, Any], note: str) -> Panel
 
 
 def keyframes(chosen: Sequence[KeyframeRecord]) -> list[list[Picture]]:
-    """Colour with the object's outline, and depth, of each keyframe; what is there of them."""
+    """Colour with the object's outline, and depth, of each keyframe, where the images exist."""
     depths = [_depth(keyframe) for keyframe in chosen]
     panels = iter(depth_panels([depth for depth in depths if depth is not None]))
     pictured = []
@@ -179,7 +179,7 @@ def _depth(keyframe: KeyframeRecord) -> Float[np.ndarray, "h w"] | None:
 
 
 def _outlined(image: UInt8[np.ndarray, "h w 3"], mask: Any) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw a bright line around what is in the mask, in a dark one, to be seen on any ground."""
+    """Draw a bright line inside a dark one around the mask, to be visible on any background."""
     from scipy.ndimage import binary_dilation
 
     if mask is None:

@@ -26,10 +26,10 @@ KEYFRAMES_TO_SHOW = 12
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` of a result folder into it, from what the folder holds. [host]
+    """Write `report.html` into a result folder, from the files of the folder. [host]
 
-    Sections of what is missing are left out, and files that cannot be read are named among the
-    warnings. All text that comes from the folder is escaped.
+    Sections without files are left out, and unreadable files are named among the warnings. All text
+    that comes from the folder is escaped.
 
     Args:
         folder: Folder of a result, from `jaxshape demo` or `jaxshape reconstruct`, finished or not.
@@ -38,7 +38,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
         The path of the page.
 
     Raises:
-        ValueError: There is no such folder.
+        ValueError: The folder does not exist.
     """
     found = read_folder(folder)
     scene = illustrations.scene(found)
@@ -78,13 +78,13 @@ def filled_page(
     """A page that needs no network; texts are escaped here, the body is HTML.
 
     Args:
-        kind: What kind of page it is, in small print.
-        title: Its title.
+        kind: Kind of the page, in small print.
+        title: Title of the page.
         subtitle: A line below the title.
         figures: Name, value and meaning of each of the figures at its top.
-        body: Its sections, as HTML.
-        scene: What the script reads, as JSON can hold it.
-        script: A script of its own; nothing else may run.
+        body: Sections of the page, as HTML.
+        scene: Data of the script, as JSON can hold it.
+        script: The page's own script; no other script may run.
     """
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return Template(_beside("page.html")).substitute(
@@ -104,13 +104,13 @@ def _beside(name: str) -> str:
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
-# ------------------------------------------------------------------ what it comes to
+# ------------------------------------------------------------------ the headline
 
 
 def _subtitle(found: ResultFolder) -> str:
     named = {"method": "searched by {}", "seed": "seed {}"}
-    told = [text.format(found.result[key]) for key, text in named.items() if key in found.result]
-    return " · ".join([f"folder {found.name}", *told])
+    known = [text.format(found.result[key]) for key, text in named.items() if key in found.result]
+    return " · ".join([f"folder {found.name}", *known])
 
 
 def _figures(figures: Iterable[tuple[str, str, str]]) -> str:
@@ -159,7 +159,9 @@ pinch to zoom.</p></section>"""
 def _grids(found: ResultFolder) -> str:
     pictures = illustrations.grids(found)
     figures = "".join(_figure([picture], picture.title, picture.note) for picture in pictures)
-    about = "F is what was measured, M what is hidden behind it; composed is F, and inside M the "
+    about = (
+        "F holds measured voxels, M the voxels hidden behind them; composed is F, and inside M the "
+    )
     return (
         f'<section><h2>Grids</h2><p class="soft">{about}refined shape.</p>'
         f'<div class="pictures">{figures}</div></section>'
@@ -176,7 +178,7 @@ def _keyframes(found: ResultFolder) -> str:
     chosen = [found.keyframes[round(i * (count - 1) / max(1, shown - 1))] for i in range(shown)]
     pictured = zip(chosen, illustrations.keyframes(chosen), strict=True)
     figures = "".join(_figure(p, k.name, tracked(k)) for k, p in pictured)
-    about = "Colour with the outline of what was taken for the object, and depth, near dark."
+    about = "Colour with the outline of the segmented object, and depth, near dark."
     some = f" {shown} of {count} are pictured." if shown < count else ""
     return (
         f'<section><h2>Keyframes</h2><p class="soft">{about}{some}</p>'

@@ -1,4 +1,4 @@
-"""The colours in which a mesh can be shown: those of the frames, or by where it comes from."""
+"""The colours of a mesh: from the frames, or by measured and predicted parts."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ class Paint(NamedTuple):
 
     Attributes:
         label: Text that names them.
-        colors: One colour for each vertex.
+        colors: A colour for each vertex.
     """
 
     label: str

@@ -1,4 +1,4 @@
-"""The colours of all figures, and what each of them stands for.
+"""The colours of all figures and their meanings.
 
 They are the palette of Okabe and Ito, which the common kinds of colour blindness keep apart.
 """

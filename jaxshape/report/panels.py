@@ -25,7 +25,7 @@ class Panel(NamedTuple):
 
     Attributes:
         title: Text above it.
-        image: Its pixels.
+        image: Pixels of the picture.
         note: Text below it.
     """
 

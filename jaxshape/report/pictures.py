@@ -88,7 +88,7 @@ def render_voxels(
 def _facing_cells(
     occupied: Bool[np.ndarray, "x y z"], axis: int, towards: Float[np.ndarray, " 3"]
 ) -> Integer[np.ndarray, "n 3"]:
-    """Occupied cells whose face along `axis` looks at the viewer uncovered, farthest first."""
+    """Occupied cells whose face along `axis` is visible to the viewer, farthest first."""
     beyond = np.roll(np.pad(occupied, 1), -int(np.sign(towards[axis])), axis)[1:-1, 1:-1, 1:-1]
     cells = np.argwhere(occupied & ~beyond)
     return cells[np.argsort(cells @ towards, kind="stable")]
@@ -102,8 +102,7 @@ def _face_pixels(
 ) -> tuple[np.ndarray, ...]:
     """Pixels that the faces cover: index of the face, row, column, and place s, t on the face.
 
-    Faces come in the order of `cells`, whose coordinates are relative to the centre of the
-    picture.
+    Faces come in the order of `cells`; coordinates are relative to the centre of the picture.
     """
     corner = cells + (np.arange(3) == axis) * (view[2, axis] > 0)
     to_pixels = view[:2].T * (pixels_per_voxel, -pixels_per_voxel)  # columns, rows

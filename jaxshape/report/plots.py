@@ -1,4 +1,4 @@
-"""Plots of searches: how losses fell, and what became of the distribution, as pycma draws them."""
+"""Plots of searches: losses and the distribution over iterations, as pycma draws them."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -55,7 +55,8 @@ def _grey(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _middle(segmented: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
-    """The pixel of an object that is nearest to the mean of them, so that a number lies on it."""
+    """The pixel of an object that is nearest to the mean of its pixels, so that a number lies on
+    it."""
     pixels = np.argwhere(segmented)
     if not len(pixels):
         return 0.0, 0.0

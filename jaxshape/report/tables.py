@@ -16,9 +16,9 @@ class Column(NamedTuple):
 
     Attributes:
         heading: Text at its top, with the unit.
-        figure: Its key in keyframes.json.
+        figure: Key of the figure in keyframes.json.
         digits: Decimals to show.
-        times: What a figure is multiplied by, from the unit of the file to that of the heading.
+        times: Factor from the unit of the file to the unit of the heading.
     """
 
     heading: str

@@ -44,12 +44,12 @@ Draw = Callable[[], Any]
 
 
 class LiveView:
-    """A server of one result folder; `refresh` takes over what changed in it."""
+    """A server of one result folder; `refresh` shows its changes."""
 
     def __init__(self, folder: str | os.PathLike[str], *, host: str, port: int) -> None:
-        """Serve on `host`, at `port` or the next that is free, and draw what is there."""
+        """Serve on `host`, at `port` or the next free one, and draw the folder."""
         self.folder = Path(folder)
-        self.found = read_folder(self.folder)  # refuses what is no folder before a server is up
+        self.found = read_folder(self.folder)  # refuses a missing folder before a server is up
         _require_own(host)
         with redirect_stdout(io.StringIO()), guarded(host):  # a banner
             self.server = viser.ViserServer(host=host, port=port, label="jaxshape", verbose=False)
@@ -62,7 +62,7 @@ class LiveView:
         self.refresh()
 
     def refresh(self) -> bool:
-        """Draw anew what changed in the folder since last time; returns whether anything did."""
+        """Draw the changes of the folder since last time; returns whether there were any."""
         stamps = {name: _stamp(self.folder / name) for name in WATCHED}
         if stamps == self._stamps or not self.folder.is_dir():
             return False
@@ -79,7 +79,7 @@ class LiveView:
     # -------------------------------------------------------------- the panel
 
     def _panel(self) -> None:
-        """Build the panel beside the picture: figures, layers to show, keyframes."""
+        """Build the panel next to the picture: figures, layers to show, keyframes."""
         gui = self.server.gui
         # Sharing would send the scene through a machine elsewhere.
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -129,7 +129,7 @@ class LiveView:
         return keyframes[min(int(self.slider.value), len(keyframes) - 1)] if keyframes else None
 
     def _look(self, event: Any) -> None:
-        """Take whoever asked to where the chosen keyframe was taken."""
+        """Move the asking client's view to the camera of the chosen keyframe."""
         keyframe = self._at_slider()
         for of, T_object_camera in camera_poses(self.found):
             if of is keyframe and event.client is not None:
@@ -140,7 +140,7 @@ class LiveView:
     # -------------------------------------------------------------- the scene
 
     def _scene(self) -> None:
-        """Draw what is new or different, and take away what is no longer there."""
+        """Draw new and changed parts, and remove missing ones."""
         nodes = _nodes(self.server.scene, self.found, self._paint())
         for name in set(self._drawn) - set(nodes):
             self._drawn.pop(name)[1].remove()
@@ -156,7 +156,7 @@ class LiveView:
             start.position = center + 4.5 * radius * np.array([0.52, 0.42, 0.74])
 
     def _paint(self) -> Paint | None:
-        """The chosen colours of the mesh, of those there are."""
+        """The chosen colours of the mesh, among the available ones."""
         there = {paint.label: paint for paint in paints(self.found).values()}
         if tuple(there) != self.paint.options and there:
             self.paint.options = tuple(there)
@@ -174,11 +174,11 @@ class LiveView:
 
 
 def view(
-    folder: str | os.PathLike[str], *, host: str, port: int, told: Callable[[str], Any]
+    folder: str | os.PathLike[str], *, host: str, port: int, on_start: Callable[[str], Any]
 ) -> None:
-    """Serve a result folder until interrupted; `told` gets the address once it is up."""
+    """Serve a result folder until interrupted; `on_start` gets the address once it is up."""
     live = LiveView(folder, host=host, port=port)
-    told(live.url)
+    on_start(live.url)
     try:
         while True:
             time.sleep(SECONDS_BETWEEN_LOOKS)
@@ -255,7 +255,7 @@ def _path(scene: viser.SceneApi, path: Float[np.ndarray, "s 2 3"]) -> Any:
 def _cubes(
     scene: viser.SceneApi, name: str, found: ResultFolder, grid: Bool[np.ndarray, "x y z"]
 ) -> Any:
-    """One cube, drawn once for each voxel that is not shut in."""
+    """A cube, drawn once for each voxel that is not enclosed."""
     shut_in = np.asarray(binary_erosion(grid), bool)
     centers = np.argwhere(grid & ~shut_in) + 0.5
     cube = trimesh.creation.box(extents=found.voxel_size)

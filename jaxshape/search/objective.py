@@ -20,7 +20,7 @@ from jaxshape.search.space import LatentSpace, raw
 Penalty = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 
-class Own(NamedTuple):
+class ObjectTerms(NamedTuple):
     """The part of the objective that differs between objects; leading axes are batch axes.
 
     Attributes:
@@ -58,7 +58,7 @@ def evaluation(
     residual: Residual,
     penalty: Penalty | None,
     code: Float[Array, " d"],
-    own: Own,
+    own: ObjectTerms,
 ) -> Evaluation:
     """Join a model, a residual and a penalty.
 
@@ -117,7 +117,7 @@ def evaluation(
     return Evaluation(loss, over_rows(shape), expansion_of_one, (prepared.shared, constants))
 
 
-def composed(how: Evaluation, space: LatentSpace, own: Own) -> Composed:
+def composed(how: Evaluation, space: LatentSpace, own: ObjectTerms) -> Composed:
     """The objective of one object as a function of the points of a space.
 
     Args:
@@ -169,7 +169,7 @@ def objective(
     """
     batch = None if grids is None else jax.tree.map(lambda x: jnp.asarray(x)[None], grids)
     prepared = prepare_one(prior, batch, precision)
-    own = Own(pick(prepared.own, 0), target, jnp.asarray(penalty_weight, jnp.float32))
+    own = ObjectTerms(pick(prepared.own, 0), target, jnp.asarray(penalty_weight, jnp.float32))
 
     def about(point):
         chosen = raw(prior)._replace(mean=jnp.zeros_like(point)) if space is None else space

@@ -16,7 +16,7 @@ from jaxshape.model.shapes import Precision, ShapePrior, pick
 from jaxshape.search.devices import numbers, over_devices
 from jaxshape.search.objective import (
     Evaluation,
-    Own,
+    ObjectTerms,
     Penalty,
     composed,
     evaluation,
@@ -130,7 +130,7 @@ def refine(
     if previous is not None and warm_start is not None:
         raise ValueError(
             "Both previous and warm_start are given; give previous to go on with the same targets,"
-            " warm_start to begin anew near an earlier search."
+            " warm_start for a new search near an earlier one."
         )
     rows = _Rows(
         keys=keys_of(keys, codes, prior),
@@ -146,7 +146,9 @@ def refine(
     def search(shared, rows):
         prior, space, weight, target_loss = vary_like(shared, rows.codes)
         searched = prepare_one(prior, rows.grids, precision)
-        own = Own(searched.own, rows.targets, jnp.full(len(rows.codes), weight, jnp.float32))
+        own = ObjectTerms(
+            searched.own, rows.targets, jnp.full(len(rows.codes), weight, jnp.float32)
+        )
         how = _evaluation(prior, searched, residual, penalty, rows.codes, own)
         loop = _Loop(refiner, how, space, own, target_loss, callback)
         states, steps, traces, path = loop.run(rows, iterations)
@@ -228,7 +230,7 @@ class _Loop(NamedTuple):
     refiner: Refiner
     how: Evaluation
     space: LatentSpace
-    own: Own
+    own: ObjectTerms
     target_loss: Float[Array, ""] | float | None
     callback: Callback | None
 
@@ -260,7 +262,9 @@ class _Loop(NamedTuple):
             begun = _Begun(*started, jnp.zeros(len(rows.codes), jnp.int32))
         return begun._replace(state=_stop_at(self.target_loss, begun.state))
 
-    def begin(self, key: Array, code: Array, own: Own, loss: Any, state: Any) -> tuple[Any, Trace]:
+    def begin(
+        self, key: Array, code: Array, own: ObjectTerms, loss: Any, state: Any
+    ) -> tuple[Any, Trace]:
         """The first state of one object."""
         point = self.space.from_code(code) if state is None else state.best.point
         if loss is None or state is not None:
@@ -293,7 +297,7 @@ def _evaluation(prior, prepared, residual, penalty, codes, own) -> Evaluation:
 
 
 def _best(
-    how: Evaluation, own: Own, states: Any, space: LatentSpace
+    how: Evaluation, own: ObjectTerms, states: Any, space: LatentSpace
 ) -> tuple[Float[Array, "object d"], Float[Array, "object x y z"], Float[Array, " object"]]:
     """Code, logits and objective of the best that each search has found.
 

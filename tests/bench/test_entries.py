@@ -53,7 +53,7 @@ def cheated(**changes):
         (cheated(objective=lambda x: x[:5]), "are not given at the 10 numbers"),
         (cheated(iou=lambda x: [*x[:-1], 0.9]), "another IoU"),
         (cheated(calls=lambda x: 500), "500 decoder calls of 64"),
-        (cheated(reached=lambda x: [[1, 0.0]] * 20), "where the objective says otherwise"),
+        (cheated(reached=lambda x: [[1, 0.0]] * 20), "contradict the objective"),
         (cheated(reached=lambda x: [[70, 0.0]] * 20), "after the budget"),
         (lambda row: row.pop("code"), "is missing"),
     ],

@@ -39,8 +39,8 @@ def test_a_card_tells_what_was_done():
     for said in (
         "mug.safetensors",
         "48 objects of `mugs/` (2 more could not be used), each filmed along 3 paths by a camera",
-        "(paper, kinect), 25% with sensor noise; inputs are what 1, 4 frames measured",
-        "conditioned on what was measured",
+        "(paper, kinect), 25% with sensor noise; inputs are measurements of 1, 4 frames",
+        "conditioned on the measurement",
         "IoU 0.600 of the decoded first codes, 0.400 in occluded voxels",
         "| Licence | CC0 |",
         "`jaxshape train ...`",

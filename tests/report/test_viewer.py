@@ -177,17 +177,17 @@ def test_an_address_of_another_machine_is_refused(folder):
 
 
 def test_an_interrupt_ends_it(folder, monkeypatch):
-    told = []
+    addresses = []
 
     def interrupt(seconds):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(viewer.time, "sleep", interrupt)
-    view(folder, host="127.0.0.1", port=0, told=told.append)
+    view(folder, host="127.0.0.1", port=0, on_start=addresses.append)
     monkeypatch.undo()
     time.sleep(0.2)
     with pytest.raises(OSError):
-        urllib.request.urlopen(told[0], timeout=2)
+        urllib.request.urlopen(addresses[0], timeout=2)
 
 
 def test_a_browser_shows_the_scene(folder, open_view):
@@ -212,7 +212,7 @@ def test_a_browser_shows_the_scene(folder, open_view):
 # --- the command ------------------------------------------------------------------------------
 
 
-def test_what_is_missing_is_told_in_a_sentence(folder, tmp_path, monkeypatch):
+def test_missing_files_are_named_in_a_sentence(folder, tmp_path, monkeypatch):
     with pytest.raises(common.BadInput, match="no folder"):
         viewing.ViewResult(tmp_path / "none").run()
     with pytest.raises(common.BadInput, match="--port"):

@@ -235,7 +235,7 @@ def _cross(draw: Draw, rest: Rest) -> list[Part]:
 
 
 def _splat(draw: Draw, rest: Rest) -> list[Part]:
-    """One broad, waisted splat in the middle."""
+    """A broad, waisted splat in the middle."""
     frame, low, high = _rails(draw, rest, draw.chance(0.3))
     half = draw.between(0.15, 0.45)
     return [*frame, sheet(rest, (-half, half), (low - 0.02, high + 0.02), draw.between(0.008, 0.02),

@@ -1,4 +1,4 @@
-"""What carries a seat: sleds, cantilevers and rockers of its own, and what carries any board."""
+"""Bases of seats: sleds, cantilevers and rockers, and the bases of any board."""
 
 import numpy as np
 
@@ -53,7 +53,7 @@ def _cantilever(draw: Draw, seat: Board) -> list[Part]:
 
 
 def _armed_loop(draw: Draw, seat: Board) -> list[Part]:
-    """One bent tube at each side is arm, front leg, runner and maybe back leg."""
+    """A single bent tube at each side forms arm, front leg, runner and sometimes back leg."""
     x, z = seat.width / 2 + draw.between(0.0, 0.03), seat.depth / 2 + draw.between(-0.02, 0.06)
     arm, radius = seat.height + draw.between(0.15, 0.28), draw.thick(0.008, 0.018)
     back, behind = -seat.depth / 2 + draw.between(-0.03, 0.04), draw.between(-0.08, 0.1)

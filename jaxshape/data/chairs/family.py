@@ -342,7 +342,7 @@ def random_chair(seed: int | np.integer, *, style: str | None = None) -> trimesh
     """Make the procedural chair of a seed. [host]
 
     Args:
-        seed: Seed of the chair, 0 or more; those from 1,000,000 on are kept for tests.
+        seed: Seed of the chair, 0 or more; seeds from 1,000,000 on are kept for tests.
         style: One of the styles of `jaxshape.data.chairs.STYLES`; None to draw one by its
             frequency.
 
@@ -352,6 +352,6 @@ def random_chair(seed: int | np.integer, *, style: str | None = None) -> trimesh
         back, arms, ...).
 
     Raises:
-        ValueError: The seed is negative, or there is no such style.
+        ValueError: The seed is negative, or the style is unknown.
     """
     return make(CHAIRS, seed, style)

@@ -43,7 +43,8 @@ def draw_seat(
 def seat_parts(
     draw: Draw, seat: Board, options: Weights, *, aprons: bool
 ) -> tuple[list[Part], Board]:
-    """The parts of a seat, and the seat as its legs see it (without what lies on the frame)."""
+    """The parts of a seat, and the seat to which legs attach (without parts that lie on the
+    frame)."""
     kind = draw.named("seat", options)
     if kind == "block":
         seat = seat._replace(thickness=draw.between(0.06, 0.14))

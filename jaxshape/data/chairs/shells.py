@@ -169,7 +169,7 @@ def tub(
 ) -> Part:
     """A seat in a wall that wraps round it and falls to the front: one surface, nothing inside.
 
-    `bottom` is the size of the underside, at height `low`, over that of the seat.
+    `bottom` is the ratio of the sizes of the underside, at height `low`, and the seat.
     """
     outline = superellipse(draw.between(2.0, 6.0), 32)
     if draw.chance(0.3):  # round behind, square in front

@@ -13,13 +13,13 @@ from jaxshape.data.formats.ply import read_ply
 from jaxshape.data.formats.stl import read_stl
 
 
-def read_parts(suffix: str, content: bytes, beside: Callable[[str], bytes]) -> list[Part]:
+def read_parts(suffix: str, content: bytes, read_relative: Callable[[str], bytes]) -> list[Part]:
     """The parts of a mesh file.
 
     Args:
         suffix: Suffix of its name, with the dot, in lower case.
         content: All of the file.
-        beside: Reads a file by its path relative to this one.
+        read_relative: Reads a file by its path relative to this one.
 
     Raises:
         Unreadable: The file is damaged.
@@ -27,6 +27,6 @@ def read_parts(suffix: str, content: bytes, beside: Callable[[str], bytes]) -> l
         TooManyFaces: There are too many triangles.
     """
     if suffix in (".gltf", ".glb"):
-        return read_gltf(content, beside)
+        return read_gltf(content, read_relative)
     readers = {".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl}
     return readers[suffix](content)

@@ -31,19 +31,19 @@ _NO_SURFACE = (0, 1, 2, 3)
 Matrix = Float[np.ndarray, "4 4"]
 
 
-def read_gltf(content: bytes, beside: Callable[[str], bytes]) -> list[Part]:
+def read_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> list[Part]:
     """The triangles of a `.gltf` or `.glb` file, one part for each primitive of each node.
 
     Args:
         content: All of the file.
-        beside: Reads a file by its path relative to this one.
+        read_relative: Reads a file by its path relative to this one.
 
     Raises:
         Unreadable: The file is damaged.
         NotSupported: It needs an extension that is not read here.
         TooManyFaces: There are too many triangles.
     """
-    file = open_gltf(content, beside)
+    file = open_gltf(content, read_relative)
     for name in file.list("extensionsRequired"):
         if name not in UNDERSTOOD and not name.startswith(HARMLESS):
             raise NotSupported(f"The file needs the glTF extension {name}; export it without.")
@@ -72,7 +72,7 @@ def read_gltf(content: bytes, beside: Callable[[str], bytes]) -> list[Part]:
 
 
 def _matrices(file: GltfFile) -> list[Matrix]:
-    """From the frame of each node to that of the scene."""
+    """Transforms from the frame of each node to the frame of the scene."""
     nodes = file.list("nodes")
     parents: dict[int, int] = {}
     for i, node in enumerate(nodes):
@@ -90,12 +90,12 @@ def _matrices(file: GltfFile) -> list[Matrix]:
             placed[child] = placed[index] @ placed[child]
             waiting.append(child)
     if seen < len(nodes):
-        raise Unreadable("Some nodes are children of their own children.")
+        raise Unreadable("Some nodes are their own descendants.")
     return placed
 
 
 def _matrix(node: dict[str, Any]) -> Matrix:
-    """From the frame of a node to that of its parent."""
+    """Transform from the frame of a node to its parent's."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     return _transform(
@@ -156,7 +156,7 @@ def _instances(file: GltfFile, node: dict[str, Any]) -> Iterator[Matrix]:
 
 
 def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> Iterator[Part]:
-    """The parts of a node's mesh, in its own frame; in that of the scene where it has a skin."""
+    """The parts of a node's mesh, in the frame of the node, or of the scene where it has a skin."""
     mesh = file.list("meshes")[node["mesh"]]
     weights = node.get("weights", mesh.get("weights", []))
     for primitive in mesh["primitives"]:
@@ -177,7 +177,7 @@ def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> I
 def _arrays(
     file: GltfFile, primitive: dict[str, Any]
 ) -> tuple[dict[str, np.ndarray], Int[np.ndarray, " n"]]:
-    """Attributes of the vertices of a primitive, and which of them follow one another."""
+    """Attributes of the vertices of a primitive, and the indices of its corners."""
     given = primitive["attributes"]
     wanted = [n for n in given if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_"))]
     attributes, corners = draco_mesh(file, primitive) or ({}, None)

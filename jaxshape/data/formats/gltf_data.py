@@ -21,7 +21,7 @@ class GltfFile(NamedTuple):
     """A glTF file whose buffers have been read.
 
     Attributes:
-        header: Its JSON.
+        header: The JSON header.
         buffers: Content of each of its buffers; None where only an extension could fill it.
     """
 
@@ -29,7 +29,7 @@ class GltfFile(NamedTuple):
     buffers: list[bytes | None]
 
     def list(self, name: str) -> list[Any]:
-        """An array of the header, such as its `nodes`; empty where it has none."""
+        """An array of the header, such as its `nodes`; empty where it is missing."""
         return self.header.get(name, [])
 
     def accessor(self, index: int) -> np.ndarray:
@@ -51,7 +51,7 @@ class GltfFile(NamedTuple):
         return values
 
     def _replaced(self, values: np.ndarray, sparse: dict[str, Any], kind: str) -> np.ndarray:
-        """The values with those replaced that the accessor gives one by one."""
+        """The values, after the sparse replacements of the accessor."""
         places, new, count = sparse["indices"], sparse["values"], sparse["count"]
         row = self.view(
             places["bufferView"], _TYPES[places["componentType"]], 1, count,
@@ -91,12 +91,12 @@ class GltfFile(NamedTuple):
         return content[start : start + length]
 
 
-def open_gltf(content: bytes, beside: Callable[[str], bytes]) -> GltfFile:
-    """Parse a `.glb` or `.gltf` file, and read what it refers to.
+def open_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> GltfFile:
+    """Parse a `.glb` or `.gltf` file, and read the buffers that it refers to.
 
     Args:
         content: All of the file.
-        beside: Reads a file by its path relative to this one.
+        read_relative: Reads a file by its path relative to this one.
 
     Raises:
         Unreadable: The file is damaged.
@@ -112,7 +112,7 @@ def open_gltf(content: bytes, beside: Callable[[str], bytes]) -> GltfFile:
     if not version.startswith("2."):
         raise NotSupported(f"The file is of glTF {version}; export glTF 2.0.")
     buffers = [
-        _buffer(about, binary if i == 0 else None, beside)
+        _buffer(about, binary if i == 0 else None, read_relative)
         for i, about in enumerate(header.get("buffers", []))
     ]
     return GltfFile(header, buffers)
@@ -124,7 +124,7 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
     if version == 1:
         raise NotSupported("The file is of glTF 1; export glTF 2.0.")
     if version != 2:
-        raise Unreadable(f"The file is of glTF {version}, which there is not.")
+        raise Unreadable(f"The file is of glTF {version}, which does not exist.")
     if length > len(content):
         raise Unreadable(f"The file says {length} bytes, but has {len(content)}.")
     chunks, start = {}, 12
@@ -140,11 +140,11 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
 
 
 def _buffer(
-    about: dict[str, Any], binary: bytes | None, beside: Callable[[str], bytes]
+    about: dict[str, Any], binary: bytes | None, read_relative: Callable[[str], bytes]
 ) -> bytes | None:
     uri, length = about.get("uri"), about["byteLength"]
     if uri is None and binary is None:
-        return None  # a placeholder for what an extension unpacks
+        return None  # a placeholder for the data that an extension unpacks
     if uri is None:
         content = binary
     elif uri.startswith("data:"):
@@ -152,7 +152,7 @@ def _buffer(
         raw = urllib.parse.unquote_to_bytes(text)
         content = base64.b64decode(raw) if head.endswith(";base64") else raw
     else:
-        content = _file(uri, beside)
+        content = _file(uri, read_relative)
     assert content is not None
     if len(content) < length:
         raise Unreadable(f"A buffer has {len(content)} bytes, but the file says {length}.")
@@ -174,15 +174,15 @@ def referred(content: bytes) -> list[str]:
     return [urllib.parse.unquote(uri) for uri in uris if not uri.startswith("data:")]
 
 
-def _file(uri: str, beside: Callable[[str], bytes]) -> bytes:
-    """A file beside the mesh: `with%20space.bin` is `with space.bin`."""
+def _file(uri: str, read_relative: Callable[[str], bytes]) -> bytes:
+    """A file next to the mesh: `with%20space.bin` is `with space.bin`."""
     name = urllib.parse.unquote(uri)
     try:
-        return beside(name)
+        return read_relative(name)
     except (FileNotFoundError, KeyError):
         if name == uri:
             raise
-        return beside(uri)  # some writers do not encode names
+        return read_relative(uri)  # some writers do not encode names
 
 
 def draco_mesh(

@@ -20,7 +20,7 @@ class _Face(NamedTuple):
 
     Attributes:
         corners: Words of its corners, such as `3/1/2`.
-        before: How many vertices stand before it.
+        before: Number of vertices before it.
     """
 
     corners: list[str]

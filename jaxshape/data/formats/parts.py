@@ -1,4 +1,4 @@
-"""What all readers of mesh files give, and how they refuse."""
+"""The results and errors of all readers of mesh files."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ MAX_FACES = MESH_FACES
 
 
 class Part(NamedTuple):
-    """Some of the triangles of a file, under the names that it gives them.
+    """Some of the triangles of a file, with the names that the file gives them.
 
     Attributes:
         name: Names of the nodes, the object or the group, joined by `/`; empty where there is none.
@@ -77,7 +77,7 @@ def positions(rows: list[list[str]]) -> Float[np.ndarray, "v 3"]:
 
 
 def checked(part: Part) -> Part:
-    """The part, whose faces refer to vertices that are there.
+    """The part, after a check that its faces refer to existing vertices.
 
     Args:
         part: Faces and vertices as they were read.

@@ -22,7 +22,7 @@ class _Property(NamedTuple):
     Attributes:
         name: Its name.
         type: NumPy's name of the type of its numbers.
-        count: The same of the length of a list; None for a single number.
+        count: NumPy's name of the type of a list's length; None for a single number.
     """
 
     name: str
@@ -52,7 +52,7 @@ def read_ply(content: bytes) -> list[Part]:
 
     Raises:
         Unreadable: The file is damaged, or does not hold as much as its header says.
-        NotSupported: Its surface is in elements that are not read.
+        NotSupported: The surface is in elements that are not read.
         TooManyFaces: There are too many triangles.
     """
     encoding, elements, data = _header(content)
@@ -63,7 +63,7 @@ def read_ply(content: bytes) -> list[Part]:
     for element in elements:
         columns[element.name], offset = _read(element, data, offset, order)
     if data[offset:].strip(b"\0 \t\r\n"):
-        raise Unreadable(f"{len(data) - offset} bytes follow that the header does not speak of.")
+        raise Unreadable(f"{len(data) - offset} bytes follow that the header does not mention.")
     try:
         vertices = np.stack([columns["vertex"][axis] for axis in "xyz"], axis=1)
     except KeyError as problem:
@@ -106,7 +106,7 @@ def _from_text(elements: list[_Element], data: bytes) -> tuple[list[_Element], b
     try:
         numbers = np.array(data.split(), np.float64).astype("<f8").tobytes()
     except ValueError as problem:
-        raise Unreadable(f"The file holds what is no number: {problem}.") from problem
+        raise Unreadable(f"The file holds a word that is not a number: {problem}.") from problem
     wider = [e._replace(properties=[wide(one) for one in e.properties]) for e in elements]
     return wider, numbers, "<"
 
@@ -150,7 +150,7 @@ def _row_type(element: _Element, data: bytes, offset: int, order: str) -> np.dty
 def _length(data: bytes, offset: int, kind: str) -> int:
     size = np.dtype(kind).itemsize
     if offset + size > len(data):
-        raise Unreadable("The file ends before all that its header says.")
+        raise Unreadable("The file holds less than its header says.")
     length = int(np.frombuffer(data, kind, 1, offset)[0])
     if not 0 <= length <= len(data):
         raise Unreadable(f"A list of the file says that it has {length} entries.")
@@ -160,7 +160,7 @@ def _length(data: bytes, offset: int, kind: str) -> int:
 def _read_rows(
     element: _Element, data: bytes, offset: int, order: str
 ) -> tuple[dict[str, Any], int]:
-    """The columns of an element whose lists have different lengths, row by row."""
+    """The columns of an element with lists of different lengths, read row by row."""
     found: dict[str, list[Any]] = {one.name: [] for one in element.properties}
     for _ in range(element.length):
         for one in element.properties:

@@ -19,7 +19,7 @@ def triangulate(
     Args:
         vertices: Corners of all polygons.
         indices: Rows of `vertices`, polygon after polygon.
-        counts: How many corners each polygon has; those of fewer than three have no area.
+        counts: Number of corners of each polygon; polygons with fewer than three have no area.
 
     Returns:
         Rows of `vertices`, `count - 2` triangles for each polygon; fewer where corners repeat.

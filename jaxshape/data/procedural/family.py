@@ -35,7 +35,7 @@ class Family(NamedTuple):
 
 
 def make(family: Family, seed: int | np.integer, style: str | None = None) -> trimesh.Trimesh:
-    """Make the object of a seed: what `random_chair` and `random_table` do. [host]"""
+    """Make the object of a seed, for `random_chair` and `random_table`. [host]"""
     if seed < 0:
         raise ValueError(f"A {family.name}'s seed was {seed}; give a whole number from 0 up.")
     styles = family.styles

@@ -1,4 +1,4 @@
-"""What carries a board from its middle or its sides: columns, stars, discs, panels, blocks."""
+"""Bases of a board other than legs: columns, stars, discs, panels, blocks."""
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def panels(draw: Draw, board: Board) -> list[Part]:
 
 
 def block(draw: Draw, board: Board) -> list[Part]:
-    """One solid body from floor to board."""
+    """A solid body from floor to board."""
     y, waist = board.height - board.thickness, draw.between(0.75, 1.0)
     if board.exponent < 2.5:
         radius = board.width / 2

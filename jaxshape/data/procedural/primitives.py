@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxshape.data.procedural.draw import Number
 
-Numbers = np.ndarray | Sequence  # whatever numpy reads as coordinates
+Numbers = np.ndarray | Sequence  # anything that numpy reads as coordinates
 
 X, Y, Z = np.eye(3)
 
@@ -51,8 +51,8 @@ def _loft_faces(rings: int, sides: int, loop: bool) -> np.ndarray:
 def loft(rings: np.ndarray, *, loop: bool = False) -> Part:
     """Skin rings of shape [..., rings, sides, 3]; the ends are capped, or joined by `loop`.
 
-    A cap pairs vertex j with vertex sides-1-j, so `sides` is even and an end ring is
-    convex, or a strip whose second half runs back along its first.
+    A cap pairs vertex j with vertex sides-1-j: `sides` must be even, and an end ring must be convex
+    or a strip that runs forth and back.
     """
     rings = rings.reshape(-1, *rings.shape[-3:])
     pieces, count, sides, _ = rings.shape
@@ -71,7 +71,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def polygon(sides: int) -> np.ndarray:
-    """A cross-section that fills [-1, 1]^2: the square for 4 sides, else a circle."""
+    """A cross-section that fills [-1, 1]^2: the square for 4 sides, otherwise a circle."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     circle = np.stack([np.cos(angle), np.sin(angle)], 1)
     return np.sign(circle) if sides == 4 else circle
@@ -86,7 +86,7 @@ def superellipse(exponent: Number, sides: int = 20, taper: Number = 0) -> np.nda
 
 
 def box(center: Numbers, size: Numbers) -> Part:
-    """One axis-aligned block."""
+    """An axis-aligned block."""
     half_x, half_y, half_z = np.asarray(size) / 2
     x, z = (polygon(4) * (half_x, half_z)).T
     y = np.array([-half_y, half_y])

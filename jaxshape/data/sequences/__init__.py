@@ -4,9 +4,9 @@ A layout is two functions: whether a folder `fits` it, and one that lists the fi
 Images are read, and checked, one frame at a time when asked for, so a long sequence never fills the
 memory. In the order of data: `frames` (what is read), `text`, `poses`, `trajectories`, `cameras`,
 `listing` (which images belong together), the room `layouts` with a file for each kind of recording,
-`unread` (files without use), `conventions` (how others write poses and depth), `evidence` (do the
-poses fit the images?), `hypotheses` (in which convention do they?), `figures` and `inspection`
-(what to know of a recording, and what to doubt).
+`unread` (files without use), `conventions` (other ways to write poses and depth), `evidence` (the
+agreement of poses and images), `hypotheses` (the conventions under which they agree), `figures` and
+`inspection` (statistics and warnings of a recording).
 
 Depth images and colour images are taken as registered: of one camera, as all these layouts promise.
 A colour image of another size but the same aspect is scaled to the depth image.
@@ -104,12 +104,12 @@ def open_sequence(
 ) -> Sequence:
     """Open a folder of RGB-D frames without reading its images. [host]
 
-    Images and poses are checked when their frame is read. Where the folder holds no camera, the one
-    that such recordings are made with is taken, and `findings` say so if that is a guess.
+    Images and poses are checked when their frame is read. Where the folder holds no camera, the
+    usual camera of such recordings is taken; `findings` say so if that is a guess.
 
     Args:
         path: Folder of the recording, or an `.npz` file of arrays.
-        depth_scale: Depth units in a metre, above 0; None for those of the layout.
+        depth_scale: Depth units in a metre, above 0; None for the scale of the layout.
         layout: Name of the layout, a key of `LAYOUTS`; None for the first that fits.
 
     Returns:
@@ -133,7 +133,7 @@ def open_sequence(
     camera, cameras, doubts = _cameras(contents, listed, shape)
     has_poses, is_guess = listed.read_pose is not None, bool(doubts)
     doubts += tuple(
-        unread(contents, has_poses=has_poses, has_camera=not is_guess, told=listed.findings)
+        unread(contents, has_poses=has_poses, has_camera=not is_guess, earlier=listed.findings)
     )
     files, remarks = _without_other_colors(listed, shape)
     return Sequence(
@@ -154,7 +154,7 @@ def open_sequence(
 
 
 def _contents_of(path: Path) -> Contents:
-    """What lies in a folder, or the one file that a recording can be."""
+    """The entries of a folder, or the file that is itself a recording."""
     if path.suffix.lower() in FILES and path.is_file():
         return Contents(path.parent, frozenset({path.name}), frozenset())
     if not path.is_dir():
@@ -186,7 +186,8 @@ def _checked_layout(name: str) -> str:
 
 
 def _nothing_fits(contents: Contents) -> str:
-    """A sentence on what was found, what each layout needs, and a folder nearby that fits."""
+    """A sentence with the files found, the files each layout needs, and a nearby folder that
+    fits."""
     folder, seen = contents.folder, sorted(contents.folders) + sorted(contents.files)
     found = f"{', '.join(seen[:4])}{', ...' if len(seen) > 4 else ''}" if seen else "nothing"
     needs = "; ".join(f"{name}: {layout.needs}" for name, layout in LAYOUTS.items())
@@ -215,7 +216,8 @@ def _may_fit(folder: Path) -> bool:
     return False
 
 
-# What all images share -------------------------------------------------------------------------
+# Properties that all images share
+# -------------------------------------------------------------------------
 
 
 def _shape_of(listed: Listed) -> tuple[int, int]:
@@ -223,13 +225,13 @@ def _shape_of(listed: Listed) -> tuple[int, int]:
     for files in listed.files[:20]:
         with suppress(SequenceError):
             return read_shape(files.depth, limits.DEPTH_PIXELS)
-    return read_shape(listed.files[0].depth, limits.DEPTH_PIXELS)  # raises what is wrong with it
+    return read_shape(listed.files[0].depth, limits.DEPTH_PIXELS)  # raises if the image is damaged
 
 
 def _cameras(
     contents: Contents, listed: Listed, shape: tuple[int, int]
 ) -> tuple[Camera, Float[np.ndarray, "n 3 3"] | None, tuple[Finding, ...]]:
-    """The camera of the first frame, those of all where they differ, and what is doubtful."""
+    """The camera of the first frame, the cameras of all frames if they differ, and doubts."""
     if listed.calibration is None:
         camera, doubts = _camera(contents, listed, shape)
         return camera, None, doubts

@@ -1,4 +1,4 @@
-"""Intrinsics of a recording: found in its files, or those its kind of camera is known for.
+"""Intrinsics of a recording: from its files, or the known values of its kind of camera.
 
 Ours put the centre of pixel (row, column) at (column + 0.5, row + 0.5); so does
 `camera-intrinsics.txt`, whose 640 x 480 images have their centre at 320, 240. OpenCV, and with it
@@ -27,7 +27,7 @@ class Camera(NamedTuple):
 
     Attributes:
         intrinsics: Camera matrix, in pixels.
-        source: Where the intrinsics come from.
+        source: Source of the intrinsics.
     """
 
     intrinsics: Float[np.ndarray, "3 3"]
@@ -40,9 +40,9 @@ class Calibration(NamedTuple):
     Attributes:
         matrices: Camera matrix of each frame, or one of all `[n 3 3]`, in pixels, where column j
             covers u in [j, j + 1).
-        shape: Height and width of the images they are of, in pixels; None for those of the depth
+        shape: Height and width of the images they are of, in pixels; None for the size of the depth
             images.
-        source: Where the cameras come from.
+        source: Source of the cameras.
     """
 
     matrices: Float[np.ndarray, "n 3 3"]
@@ -55,7 +55,7 @@ class DefaultCamera(NamedTuple):
 
     Attributes:
         numbers: fx, fy, cx, cy in OpenCV's pixels, of 640 x 480 images.
-        source: Where the numbers come from.
+        source: Source of the numbers.
         sure: Whether the camera was calibrated for this very recording, or is a guess.
     """
 
@@ -117,7 +117,7 @@ def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int])
     """A known camera, scaled to images of `shape`; `SequenceError` if it cannot have made them."""
     if not same_aspect(shape, (480, 640)):
         raise SequenceError(
-            f"{folder} holds no camera, and that of {default.source} makes images of 640 x 480, "
+            f"{folder} holds no camera, and {default.source} makes images of 640 x 480, "
             f"not of {size(shape)}; expected the 3x3 camera matrix: write it to cam_K.txt there."
         )
     intrinsics = np.diag([shape[1] / 640, shape[0] / 480, 1]) @ _from_opencv(*default.numbers)
@@ -129,9 +129,9 @@ def guessed(camera: Camera) -> Finding:
     fx, fy, cx, cy = intrinsic_numbers(camera.intrinsics)
     return Finding(
         f"no camera file; focal lengths {fx:g}, {fy:g} and principal point {cx:g}, {cy:g} are "
-        f"those of {camera.source}",
-        "Write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt in the folder: 5 % of focal length bend "
-        "the surface and the way of the camera.",
+        f"taken from {camera.source}",
+        "Write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt in the folder: an error of 5 % in the "
+        "focal length bends the surface and the camera's path.",
     )
 
 
@@ -201,12 +201,12 @@ def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
 def _scaled(
     K: Float[np.ndarray, "*n 3 3"], of: tuple[int, int], shape: tuple[int, int]
 ) -> Float[np.ndarray, "*n 3 3"]:
-    """Cameras of images of a size, for images of another; what is not finite stays so."""
+    """Cameras of images of size `of`, scaled to images of size `shape`."""
     return np.array([[shape[1] / of[1]], [shape[0] / of[0]], [1.0]]) * K
 
 
 def _checked(K: Matrix, path: Path | str, shape: tuple[int, int]) -> Matrix:
-    """The matrix, if it can be that of images of `shape`, else `SequenceError`."""
+    """The matrix; `SequenceError` if it cannot belong to images of `shape`."""
     (h, w), (fx, fy, cx, cy) = shape, intrinsic_numbers(K)
     if not (np.isfinite(K).all() and min(fx, fy) > 0 and np.array_equal(K[2], (0, 0, 1))):
         raise SequenceError(

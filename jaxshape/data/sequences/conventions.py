@@ -23,20 +23,20 @@ AS_GIVEN = "as-given"
 """The name that stands for our own convention, where it is stated and not found."""
 
 
-class Of(NamedTuple):
+class Rule(NamedTuple):
     """A convention of poses or of depth images.
 
     Attributes:
         meaning: A sentence without its full stop, for people.
-        turned: From what was read, a pose or a depth image and its camera matrix, to ours.
+        to_ours: Function from a pose, or a depth image and its camera matrix, to our convention.
     """
 
     meaning: str
-    turned: Callable[..., Float[np.ndarray, "_ _"]]
+    to_ours: Callable[..., Float[np.ndarray, "_ _"]]
 
 
 def _from_wxyz(T: Pose) -> Pose:
-    """The pose whose quaternion w x y z was read as x y z w."""
+    """The correct pose, after its quaternion w x y z was read as x y z w."""
     w, x, y, z = Rotation.from_matrix(T[:3, :3]).as_quat()
     return _with_rotation(T, Rotation.from_quat([x, y, z, w]).as_matrix())
 
@@ -72,23 +72,23 @@ def _from_mirrored(depth: Depth, K: Matrix) -> Depth:
     return np.ascontiguousarray(depth[:, ::-1])
 
 
-OF_POSES = {
-    "wxyz": Of("quaternions are w x y z, not x y z w", _from_wxyz),
-    "transposed": Of("rotations are transposed: stored by columns", _from_rotation_by_columns),
-    "centimetres": Of("translations are in centimetres", partial(_in_units, 100.0)),
-    "millimetres": Of("translations are in millimetres", partial(_in_units, 1000.0)),
-    "inverted": Of("poses map world to camera", np.linalg.inv),
-    "opengl": Of("cameras look along -z with y up, as in OpenGL, ARKit and NeRF", _from_opengl),
+POSE_RULES = {
+    "wxyz": Rule("quaternions are w x y z, not x y z w", _from_wxyz),
+    "transposed": Rule("rotations are transposed: stored by columns", _from_rotation_by_columns),
+    "centimetres": Rule("translations are in centimetres", partial(_in_units, 100.0)),
+    "millimetres": Rule("translations are in millimetres", partial(_in_units, 1000.0)),
+    "inverted": Rule("poses map world to camera", np.linalg.inv),
+    "opengl": Rule("cameras look along -z with y up, as in OpenGL, ARKit and NeRF", _from_opengl),
 }
 """Conventions of poses, in the order in which they are undone."""
 
-OF_DEPTH = {
-    "mirrored": Of("depth images are mirrored left to right", _from_mirrored),
-    "ray": Of("depth is measured along each ray, not along z", _from_ray),
+DEPTH_RULES = {
+    "mirrored": Rule("depth images are mirrored left to right", _from_mirrored),
+    "ray": Rule("depth is measured along each ray, not along z", _from_ray),
 }
 """Conventions of depth images, in the order in which they are undone."""
 
-CONVENTIONS = (*OF_POSES, *OF_DEPTH)
+CONVENTIONS = (*POSE_RULES, *DEPTH_RULES)
 """Names of all conventions."""
 
 
@@ -97,8 +97,8 @@ class Convention:
     """A convention of a whole recording.
 
     Attributes:
-        names: Names among `CONVENTIONS` of all that differs from ours; empty for our own.
-        depth_scale: Depth units in a metre, above 0; None for those of the recording.
+        names: Names, among `CONVENTIONS`, of the differences from ours; empty for our own.
+        depth_scale: Depth units in a metre, above 0; None for the scale of the recording.
     """
 
     names: tuple[str, ...] = ()
@@ -112,8 +112,10 @@ class Convention:
 
     @property
     def meaning(self) -> str:
-        """What differs from ours, in words."""
-        parts = [(OF_POSES | OF_DEPTH)[name].meaning for name in CONVENTIONS if name in self.names]
+        """The differences from ours, in words."""
+        parts = [
+            (POSE_RULES | DEPTH_RULES)[name].meaning for name in CONVENTIONS if name in self.names
+        ]
         if self.depth_scale is not None:
             parts.append(f"a metre has {self.depth_scale:g} depth units")
         return " and ".join(parts)
@@ -131,10 +133,10 @@ def our_pose(T: Pose, names: tuple[str, ...]) -> Pose:
 
     Args:
         T: The pose as it was read `[4 4]`, rigid.
-        names: Names of conventions; those of depth images are passed over.
+        names: Names of conventions; depth conventions are ignored.
     """
-    for name, of in OF_POSES.items():
-        T = of.turned(T) if name in names else T
+    for name, rule in POSE_RULES.items():
+        T = rule.to_ours(T) if name in names else T
     return T
 
 
@@ -143,25 +145,25 @@ def our_depth(depth: Depth, K: Matrix, names: tuple[str, ...]) -> Depth:
 
     Args:
         depth: The image as it was read `[h w]`.
-        K: Its camera matrix.
-        names: Names of conventions; those of poses are passed over.
+        K: Camera matrix of the image.
+        names: Names of conventions; pose conventions are ignored.
     """
-    for name, of in OF_DEPTH.items():
-        depth = of.turned(depth, K) if name in names else depth
+    for name, rule in DEPTH_RULES.items():
+        depth = rule.to_ours(depth, K) if name in names else depth
     return depth
 
 
 def read_as(sequence: Sequence, convention: Convention) -> Sequence:
-    """A recording whose frames are turned into our convention when they are read.
+    """The recording, with frames turned into our convention when they are read.
 
     Args:
         sequence: The recording as it is written.
         convention: The convention in which it is written.
     """
     names = convention.names
-    if any(name in OF_POSES for name in names):
+    if any(name in POSE_RULES for name in names):
         sequence = replace(sequence, read_pose=partial(_pose, sequence.read_pose, names))
-    if any(name in OF_DEPTH for name in names):
+    if any(name in DEPTH_RULES for name in names):
         sequence = replace(sequence, correct_depth=partial(our_depth, names=names))
     return replace(sequence, depth_scale=convention.depth_scale or sequence.depth_scale)
 

@@ -23,7 +23,7 @@ def read_document(path: Path) -> str:
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds one object; `SequenceError` if it holds anything else."""
+    """Read a JSON file that holds one object; `SequenceError` if it holds other values."""
     try:
         return reading.read_json_object(path)
     except (OSError, ValueError) as error:

@@ -2,4 +2,4 @@
 
 
 class SequenceError(ValueError):
-    """A sequence on disk is not what its layout promises; says which file, and what to do."""
+    """A sequence on disk does not match its layout; the message names the file and a remedy."""

@@ -1,4 +1,4 @@
-"""How well poses and depth images fit: do neighbouring frames see the same surface at one place?"""
+"""Agreement of poses and depth images: whether neighbouring frames see a surface at one place."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -47,7 +47,7 @@ class Pair(NamedTuple):
     by_columns: bool
 
 
-class Seen(NamedTuple):
+class ConvertedPair(NamedTuple):
     """A pair whose depth images are in our convention.
 
     Attributes:
@@ -64,11 +64,11 @@ class Seen(NamedTuple):
 def telling_pairs(sequence: Sequence, *, count: int = 8) -> tuple[Pair, ...]:
     """Pairs of frames from all over a recording between which the camera clearly moved.
 
-    That is judged by the depth images alone, so that it does not depend on how poses are written.
+    The motion is judged by the depth images alone, independent of the convention of the poses.
     Frames without a pose, or that cannot be read, are passed over.
 
     Args:
-        sequence: The recording, whose poses and depth images are taken as they are written.
+        sequence: The recording; its poses and depth images are taken as they are written.
         count: Pairs that are looked for, 1 or more.
     """
     read = lru_cache(maxsize=2)(lambda index: _depth(sequence, index))
@@ -81,7 +81,8 @@ def telling_pairs(sequence: Sequence, *, count: int = 8) -> tuple[Pair, ...]:
 def _most_telling(
     sequence: Sequence, first: int, read: Callable[[int], Float[np.ndarray, "h w"] | None]
 ) -> tuple[float, Pair] | None:
-    """The nearest frame that tells much, or else that which tells most, and how little it moved."""
+    """The nearest frame with clear motion, otherwise the frame with most motion; with the share of
+    pixels that did not move."""
     a, pose_a, best = read(first), _pose(sequence, first), None
     if a is None or pose_a is None:
         return None
@@ -103,7 +104,7 @@ def _most_telling(
 
 def _depth(sequence: Sequence, index: int) -> Float[np.ndarray, "h w"] | None:
     """A depth image at the depth scale of the recording, plausible or not; None if damaged."""
-    with suppress(SequenceError):  # whoever uses the frame will hear of it
+    with suppress(SequenceError):  # reading the frame reports it
         raw = read_raw_depth(sequence.files[index].depth, sequence.shape)
         valid = (raw > 0) & (raw < SATURATED)
         depth = np.where(valid, raw / sequence.depth_scale, 0)
@@ -131,30 +132,32 @@ def stored_by_columns(sequence: Sequence) -> bool:
     return any(pose is not None and pose[1] for pose in poses)
 
 
-def seen_by(pairs: tuple[Pair, ...], names: tuple[str, ...] = ()) -> tuple[Seen, ...]:
+def seen_by(pairs: tuple[Pair, ...], names: tuple[str, ...] = ()) -> tuple[ConvertedPair, ...]:
     """The pairs with depth images that are taken as written in these conventions.
 
     Args:
         pairs: The pairs.
-        names: Names of conventions; those of poses are passed over.
+        names: Names of conventions; pose conventions are ignored.
     """
 
-    def both() -> Iterator[Seen]:
+    def both() -> Iterator[ConvertedPair]:
         for pair in pairs:
             a = our_depth(pair.depth_a, pair.K_a, names)
-            yield Seen(_points(a, pair.K_a), our_depth(pair.depth_b, pair.K_b, names), pair)
+            yield ConvertedPair(
+                _points(a, pair.K_a), our_depth(pair.depth_b, pair.K_b, names), pair
+            )
 
     return tuple(both())
 
 
 def agreement(
-    seen: tuple[Seen, ...],
+    seen: tuple[ConvertedPair, ...],
     names: tuple[str, ...] = (),
     *,
     longer: float = 1.0,
     tolerance: float = TOLERANCE,
 ) -> float:
-    """Mean share, over pairs, of the pixels which the second frame sees at the same place.
+    """Mean share, over pairs, of the pixels that the second frame sees at the same place.
 
     A pixel counts where the second frame measured something at its place, but at least half of all
     pixels count, so that poses which turn the camera away win nothing.
@@ -162,7 +165,7 @@ def agreement(
     Args:
         seen: The pairs, with depth images in our convention.
         names: Names of conventions in which the poses are taken as written.
-        longer: Factor by which the depth images are made shallower: that of their depth scale.
+        longer: Factor on the depth scale, by which the depths are divided.
         tolerance: Share of the depth within which two frames see the same surface.
 
     Returns:

@@ -18,11 +18,11 @@ from jaxshape.data.sequences.hypotheses import Reading
 from jaxshape.data.sequences.listing import numbers_in
 
 SAMPLES = 12
-"""Frames, from all over a recording, whose images are read."""
+"""Number of frames, spread over a recording, whose images are read."""
 
 
 class Gap(NamedTuple):
-    """Frames that are missing, by the numbers or times of those around them.
+    """Missing frames, between two frames with neighbouring numbers or times.
 
     Attributes:
         after: Name of the frame before the gap.
@@ -61,7 +61,7 @@ class Poses(NamedTuple):
     Attributes:
         known: Frames with a pose.
         length: Length of the camera's path between frames with poses, in metres.
-        reading: How well the poses fit the depth images, as written and otherwise.
+        reading: Agreement of the poses with the depth images, as written and in other conventions.
         damaged: A sentence for each pose that cannot be used.
         is_used: Whether the best convention of `reading` is that in which the recording is read.
     """
@@ -141,7 +141,8 @@ def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
 
 
 def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:
-    """Gaps between frames, by the times of the frames, or else by the numbers in their names.
+    """Gaps between frames, by the times of the frames, or without times by the numbers in their
+    names.
 
     A step between frames is a gap when it is half as long again as the usual one.
     """

@@ -30,8 +30,8 @@ class Finding(NamedTuple):
     """A remark on a recording that can still be read.
 
     Attributes:
-        evidence: What was noticed.
-        advice: What to do about it.
+        evidence: The observation.
+        advice: A remedy.
     """
 
     evidence: str
@@ -101,7 +101,7 @@ class Sequence:
         layout: Name of the layout on disk, a key of `LAYOUTS`.
         intrinsics: Camera matrix of all depth images, or of the first where each has its own
             `[3 3]`, in pixels, where column j covers u in [j, j + 1).
-        camera: Where the intrinsics come from.
+        camera: Source of the intrinsics.
         files: Files of each frame.
         read_pose: Index of a frame, from 0, to its T_world_camera `[4 4]`, checked; None where
             there is none.
@@ -112,12 +112,12 @@ class Sequence:
         color_delays: Seconds from a depth image to its colour image `[n]`, NaN where it has none;
             None without times.
         findings: Remarks made on opening that a user should know.
-        cameras: Camera matrix of each depth image `[n 3 3]`, in pixels; None where `intrinsics` is
-            that of all.
-        camera_is_guess: Whether the recording holds no camera, and that of such recordings is
-            taken.
-        correct_depth: From a depth image as it is written, in metres, and its camera matrix to
-            depth along the optical axis; None where it is written so.
+        cameras: Camera matrix of each depth image `[n 3 3]`, in pixels; None where all images share
+            `intrinsics`.
+        camera_is_guess: Whether the recording holds no camera, so that the usual camera of such
+            recordings is taken.
+        correct_depth: Function from a depth image as it is written, in metres, and its camera
+            matrix to depth along the optical axis; None where no correction is needed.
     """
 
     layout: str
@@ -168,7 +168,7 @@ class Sequence:
         return self.intrinsics if self.cameras is None else self.cameras[index]
 
     def read_depth(self, index: int) -> Float[np.ndarray, "h w"]:
-        """Read the depth image of one frame, and nothing else of it.
+        """Read only the depth image of one frame.
 
         Args:
             index: Number of the frame, from 0.
@@ -257,7 +257,8 @@ def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
 
 
 def likely_depth_scales(median: float, depth_scale: float) -> str:
-    """The usual scales at which a median depth becomes that of an object in a room, in words."""
+    """The usual scales at which a median depth becomes plausible for an object in a room, in
+    words."""
     usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
     distance = {scale: abs(np.log(scale / usual)) for scale in USUAL_DEPTH_SCALES}
     nearest = min(distance, key=distance.__getitem__)

@@ -1,4 +1,4 @@
-"""Which convention a recording is written in, found by how well its poses fit its depth images."""
+"""The convention of a recording, found by the agreement of its poses with its depth images."""
 
 from collections.abc import Iterator
 from itertools import combinations
@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxshape.data.sequences.conventions import CONVENTIONS, OF_DEPTH, Convention
+from jaxshape.data.sequences.conventions import CONVENTIONS, DEPTH_RULES, Convention
 from jaxshape.data.sequences.evidence import (
     TOLERANCE,
+    ConvertedPair,
     Pair,
-    Seen,
     agreement,
     seen_by,
     stored_by_columns,
@@ -19,24 +19,25 @@ from jaxshape.data.sequences.evidence import (
 from jaxshape.data.sequences.frames import USUAL_DEPTH_SCALES, Sequence
 
 FITS = 0.7
-"""Agreement from which a convention fits; noise and what stands in between leave .8 to .99."""
+"""Agreement from which a convention fits; with noise and occlusion, correct poses have .8 to
+.99."""
 
 GOOD = 0.9
 """Agreement below which conventions that differ in more than one thing are tried, too."""
 
 SURE, DOUBT = 3.0, 2.0
-"""By which factor another convention has to leave fewer pixels in disagreement, to be used without
-being asked for, and to be named."""
+"""Factors by which another convention must reduce the disagreeing pixels: to be used without being
+asked for, and to be named."""
 
 FINE, FINER = 0.01, 1.5
-"""Tolerance at which depth scales are compared that differ little, and the factor, as `DOUBT`, from
-which one is named: with 1200 units read as 1000, 94 % agree to 2 %, and 76 % to 1 %, not 86 %."""
+"""Tolerance at which similar depth scales are compared, and the factor, as `DOUBT`, from which one
+is named: with 1200 units read as 1000, 94 % agree to 2 %, and 76 % to 1 %, not 86 %."""
 
 LEAST = 0.05
-"""Agreement that another convention has to gain at least, to be used or named."""
+"""Least gain of agreement for another convention to be used or named."""
 
 SIMPLE = 0.03
-"""Agreement that a simpler convention may lack."""
+"""Loss of agreement allowed for a simpler convention."""
 
 _DEPTHS = (0.3, 7.0)  # metres: median depths at which a depth scale is believed
 _APART = (("centimetres", "millimetres"), ("wxyz", "transposed"))  # never both
@@ -55,13 +56,13 @@ class Hypothesis(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """How a recording may be read, and with what evidence.
+    """The conventions in which a recording may be written, with the evidence.
 
     Attributes:
         given: Agreement of poses and depth images as they are written, from 0 to 1.
         pairs: Pairs of frames that were compared; without any, nothing is known.
-        best: The convention that fits best; None where none is better than what is written.
-        rival: Another convention that is as simple and fits nearly as well; None without one.
+        best: The convention that fits best; None if no other is better than the written one.
+        rival: Another convention that is equally simple and fits nearly as well; None without one.
         by_columns: Whether matrices are stored by columns, of which there is no doubt.
         tolerance: Share of the depth to which pixels had to agree.
     """
@@ -89,7 +90,7 @@ def reading_of(sequence: Sequence, median: float) -> Reading:
 
     Args:
         sequence: The recording, read as it is written.
-        median: Its median depth, in metres.
+        median: Median depth of the recording, in metres.
     """
     pairs = telling_pairs(sequence)
     by_columns = any(pair.by_columns for pair in pairs) or stored_by_columns(sequence)
@@ -113,12 +114,12 @@ class _Search:
     def __init__(self, pairs: tuple[Pair, ...], sequence: Sequence, median: float) -> None:
         self.own, self.median = sequence.depth_scale, median
         self.pairs = pairs
-        self.seen: dict[tuple[str, ...], tuple[Seen, ...]] = {}
+        self.seen: dict[tuple[str, ...], tuple[ConvertedPair, ...]] = {}
 
     def share(
         self, names: tuple[str, ...], longer: float = 1.0, tolerance: float = TOLERANCE
     ) -> float:
-        of_depth = tuple(name for name in names if name in OF_DEPTH)
+        of_depth = tuple(name for name in names if name in DEPTH_RULES)
         if of_depth not in self.seen:
             self.seen[of_depth] = seen_by(self.pairs, of_depth)
         seen = self.seen[of_depth]
@@ -193,7 +194,8 @@ def _changes(one: Hypothesis) -> int:
 
 
 def _simplest(found: list[Hypothesis], given: float) -> Hypothesis | None:
-    """The simplest of those that fit nearly as well as the best, if that is better than `given`."""
+    """The simplest hypothesis that fits nearly as well as the best, if it is better than
+    `given`."""
     top = max((one.share for one in found), default=0.0)
     if not _is_better(top, given, DOUBT):
         return None
@@ -202,7 +204,7 @@ def _simplest(found: list[Hypothesis], given: float) -> Hypothesis | None:
 
 
 def _rival(found: list[Hypothesis], best: Hypothesis) -> Hypothesis | None:
-    """Another convention, as simple, that fits nearly as well."""
+    """Another convention that is equally simple and fits nearly as well."""
     others = [
         one
         for one in found

@@ -29,7 +29,7 @@ _USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; beyond them a scale is doub
 
 
 BADLY = 0.5
-"""Agreement of poses and depth images below which nothing good can come of them."""
+"""Agreement of poses and depth images below which a reconstruction must fail."""
 
 
 class Inspection(NamedTuple):
@@ -43,7 +43,7 @@ class Inspection(NamedTuple):
         masks: Frames with a mask.
         gaps: Missing frames.
         rate: Depth images a second; None without times.
-        warnings: What looks wrong, and what to do about it.
+        warnings: Suspicious observations, each with a remedy.
     """
 
     sequence: Sequence
@@ -61,7 +61,8 @@ def inspect_sequence(
 ) -> Inspection:
     """Look at a recording: names and poses of all frames, and images of some.
 
-    Where poses and depth images fit far better in another convention, that is used and said.
+    If poses and depth images fit far better in another convention, it is used, and a warning says
+    so.
 
     Args:
         sequence: The recording, read as it is written.
@@ -156,15 +157,15 @@ def _of_scale(median: float, own: float, reading: Reading | None) -> Iterator[Fi
         yield fault._replace(advice=fault.advice[0].upper() + fault.advice[1:])
     elif not low <= median <= high:
         yield Finding(
-            f"the median depth is {median:.3g} m at depth scale {own:g}; that of an object in a "
-            f"room is {low:g} to {high:g} m",
+            f"the median depth is {median:.3g} m at depth scale {own:g}; an object in a room is "
+            f"{low:g} to {high:g} m away",
             f"Check the unit: is --depth-scale {likely_depth_scales(median, own)} meant?",
         )
 
 
 def _of_camera(sequence: Sequence) -> Iterator[Finding]:
     (h, w), (fx, fy, cx, cy) = sequence.shape, intrinsic_numbers(sequence.intrinsics)
-    advice = "Check that the camera is that of the depth images, at their size."
+    advice = "Check that the camera belongs to the depth images, at their size."
     if max(abs(cx / w - 0.5), abs(cy / h - 0.5)) > 0.1:
         yield Finding(
             f"the principal point {cx:.1f}, {cy:.1f} is far from the centre of {w} x {h} pixels",
@@ -212,8 +213,7 @@ def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:
             yield Finding(
                 f"the poses fit the depth images badly: {reading.given:.0%} {compared}, in no "
                 "known convention many more",
-                "Check the depth scale, the camera, and that the poses are those of the depth "
-                "images.",
+                "Check the depth scale, the camera, and that the poses belong to the depth images.",
             )
 
 

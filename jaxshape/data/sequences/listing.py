@@ -27,7 +27,7 @@ class Contents(NamedTuple):
         folder: The folder.
         files: Names of its files.
         folders: Names of its sub-folders.
-        others: Names of what is neither, as pipes, devices and links to nothing; none is opened.
+        others: Names of other entries, such as pipes, devices and links to nothing; none is opened.
     """
 
     folder: Path
@@ -45,7 +45,7 @@ class Listed(NamedTuple):
         read_pose: Index of a frame to its pose; None where the recording has no poses.
         times: Times of the depth images, in seconds; None where they are not known.
         color_delays: Seconds from a depth image to its colour image; None where they are not known.
-        camera: The camera of such recordings, for folders that hold none.
+        camera: The usual camera of such recordings, for folders without a camera.
         calibration: Cameras that the recording's own files give; None where its folder is searched
             for one.
         findings: Remarks that a user should know.
@@ -88,7 +88,7 @@ def files_in(
     for name in names:
         if name in contents.folders:
             folder = contents.folder / name
-            inside = list_folder(folder)  # reading says what is wrong with the others
+            inside = list_folder(folder)  # reading reports the faults of the others
             found = (os.path.splitext(file) for file in inside.files | inside.others)
             chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
             return {stem: folder / (stem + end) for stem, end in sorted(chosen, key=_natural)}
@@ -119,7 +119,8 @@ def mask_images(contents: Contents) -> dict[str, Path]:
     return files_in(contents, ("masks", "mask"), COLOR_SUFFIXES)
 
 
-# Which belong together -------------------------------------------------------------------------
+# Files that belong together
+# -------------------------------------------------------------------------
 
 
 def numbers_in(name: str) -> tuple[int, ...]:
@@ -127,7 +128,8 @@ def numbers_in(name: str) -> tuple[int, ...]:
 
 
 def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | None]:
-    """For each name the file of the same name, else the one with the same numbers in its name."""
+    """For each name the file of the same name, otherwise the one with the same numbers in its
+    name."""
     by_number: dict[tuple[int, ...], Path | None] = {}
     for name, path in offered.items():
         by_number[numbers_in(name)] = None if numbers_in(name) in by_number else path
@@ -151,7 +153,7 @@ def frame_files(
     Args:
         contents: The folder.
         depth: Depth images by name.
-        color: Colour image of each; None for those of the same names or numbers.
+        color: Colour image of each; None for images with the same names or numbers.
         confidence: Confidence map of each; None for none.
     """
     color = partners(depth, color_images(contents)) if color is None else color
@@ -163,10 +165,10 @@ def frame_files(
 def nearest_in_time(
     wanted: Float[np.ndarray, " n"], offered: Float[np.ndarray, " m"]
 ) -> Int[np.ndarray, " n"]:
-    """Index of the reading nearest to each wanted time; -1 where even that is another moment.
+    """Index of the reading nearest to each wanted time; -1 where even that is too far away.
 
-    That is when it is farther than half the usual time between readings, or `NEAR` if that is more.
-    `offered` rises.
+    The limit is half the usual time between readings, or `NEAR` if that is more. `offered`
+    increases.
     """
     if len(offered) == 0:
         return np.full(len(wanted), -1)

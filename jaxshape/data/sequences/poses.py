@@ -1,4 +1,5 @@
-"""Poses of a recording: matrices in files, what makes them rigid, and poses between two times."""
+"""Poses of a recording: matrices in files, checks that they are rigid, and interpolation in
+time."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +32,7 @@ class StoredByColumns(SequenceError):
 
 
 def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
-    """Read a square matrix of `size` rows of numbers; `SequenceError` if it is anything else.
+    """Read a square matrix of `size` rows of numbers; `SequenceError` if it is not.
 
     Comments and commas are passed over.
     """
@@ -51,7 +52,7 @@ def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
 def read_pose(path: Path | None) -> Float[np.ndarray, "4 4"] | None:
     """Read a 4x4 rigid motion; None without a file, or where it holds NaN or infinity.
 
-    7-Scenes writes such poses where its tracking was lost.
+    7-Scenes writes NaN where its tracking was lost.
     """
     if path is None:
         return None
@@ -67,7 +68,7 @@ def known(T: Float[np.ndarray, "4 4"], source: object) -> Float[np.ndarray, "4 4
 
 
 def is_rigid(T: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "*batch"]:
-    """Whether matrices are rigid motions, within what eight digits and rounding leave."""
+    """Whether matrices are rigid motions, up to eight digits and rounding."""
     R = T[..., :3, :3]
     with np.errstate(invalid="ignore", over="ignore"):
         last = np.abs(T[..., 3, :] - (0, 0, 0, 1)).max(axis=-1) <= 1e-6
@@ -117,8 +118,9 @@ def poses_at(
 ) -> Callable[[int], Float[np.ndarray, "4 4"] | None]:
     """Poses of a trajectory at other times: a function of the index into `wanted`.
 
-    `times` rise. Between two poses at most `READABLE_GAP` apart the position is interpolated and
-    the rotation along its geodesic; else the nearest is taken, if it is `NEAR`; else there is none.
+    `times` rise. Between two poses at most `READABLE_GAP` apart, the position is interpolated
+    linearly and the rotation along its geodesic. Otherwise the nearest pose is taken if it is
+    within `NEAR`, or none.
     """
     later = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
 

@@ -13,7 +13,8 @@ from jaxshape import limits, reading
 from jaxshape.data.sequences.errors import SequenceError
 
 FORMATS = ("PNG", "JPEG", "TIFF", "PPM")
-"""Formats that Pillow may decode, PGM among the last; those that start other programs are not."""
+"""Formats that Pillow may decode (PPM includes PGM); formats that start other programs are left
+out."""
 
 
 class Stored(NamedTuple):
@@ -46,7 +47,7 @@ def open_picture(picture: Picture, most: int) -> Iterator[Image.Image]:
     Raises:
         OSError: It cannot be opened.
         ValueError: It is damaged, not a regular file, or larger.
-        SequenceError: It is an EXR image, and what reads them is not installed.
+        SequenceError: It is an EXR image, and the package that reads EXR is not installed.
     """
     if isinstance(picture, Stored):
         yield _from_array(picture.pixels, most)
@@ -59,7 +60,7 @@ def open_picture(picture: Picture, most: int) -> Iterator[Image.Image]:
             yield _from_array(np.load(picture, mmap_mode="r", allow_pickle=False), most)
         else:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", module="PIL")  # what matters is an error
+                warnings.filterwarnings("ignore", module="PIL")  # only errors matter
                 with Image.open(file, formats=FORMATS) as image:
                     image.filename = str(picture)
                     _check_size(image.width, image.height, most)

@@ -46,8 +46,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
     - `.log` (Redwood, Open3D): a line `frame frame frames`, then the 4x4 camera to world.
     - `.json` (Open3D's PinholeCameraTrajectory): 4x4 world to camera, by columns.
-    - Anything else is TUM's: `time tx ty tz qx qy qz qw`, camera to world, a pose on each line. Its
-      poses are numbered in their order.
+    - Other files are in TUM's format: `time tx ty tz qx qy qz qw`, camera to world, a pose on each
+      line. Its poses are numbered in their order.
 
     Poses that hold NaN, as some write them where tracking was lost, are left out.
 
@@ -88,7 +88,7 @@ def write_trajectory(
     """Write a trajectory in the format of the suffix, as `read_trajectory` reads it. [host]
 
     Args:
-        path: The file to write: `.log` or `.json` (Open3D), anything else for TUM's format.
+        path: The file to write: `.log` or `.json` (Open3D), any other for TUM's format.
         trajectory: The poses; without times, the numbers of the frames take their place in TUM's
             format.
         camera: The camera, which `.json` needs; None for the other formats.
@@ -159,7 +159,7 @@ def _read_log(text: str) -> Trajectory:
         [[[number(w) for w in row] for row in words[i + 1 : i + 5]] for i in _fifth(words)]
     )
     frames = np.array([int(words[i][0]) for i in _fifth(words)], dtype=int)
-    if (np.diff(frames) <= 0).any():  # numbers of something else, such as fragments
+    if (np.diff(frames) <= 0).any():  # other numbers, such as those of fragments
         frames = np.arange(len(frames))
     return Trajectory(T.reshape(-1, 4, 4), frames)
 

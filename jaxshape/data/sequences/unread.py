@@ -19,30 +19,30 @@ _OURS = ("keyframes.json", "result.json")
 
 
 def unread(
-    contents: Contents, *, has_poses: bool, has_camera: bool, told: tuple[Finding, ...] = ()
+    contents: Contents, *, has_poses: bool, has_camera: bool, earlier: tuple[Finding, ...] = ()
 ) -> Iterator[Finding]:
-    """Remarks on files that lie in a recording for which no use was found.
+    """Remarks on files of a recording that are not used.
 
     Args:
         contents: The folder.
         has_poses: Whether the recording was found to have poses; if so, no others are missed.
         has_camera: Whether a camera was found.
-        told: Remarks that were made already; files that they name are left out.
+        earlier: Remarks made before; files that they name are left out.
     """
     if contents.others:
         yield Finding(
-            f"not read, as they are no files: {', '.join(sorted(contents.others)[:4])}",
+            f"not read, as they are no regular files: {', '.join(sorted(contents.others)[:4])}",
             "Links to nothing, pipes and devices are passed over; copy the files again, if they "
-            "are of the recording.",
+            "belong to the recording.",
         )
-    told_of = " ".join(evidence for evidence, _ in told)
-    untold = frozenset(name for name in contents.files if name not in told_of)
-    contents = contents._replace(files=untold)
+    named = " ".join(evidence for evidence, _ in earlier)
+    unnamed = frozenset(name for name in contents.files if name not in named)
+    contents = contents._replace(files=unnamed)
     if not has_poses and (found := _like(_POSES, contents)):
         yield Finding(
             f"no poses are read, though {found} may hold them",
             "Poses are read from groundtruth.txt beside depth.txt, poses/N.txt, trajectory.log or "
-            "an Open3D trajectory.json: write theirs so, or the camera is tracked.",
+            "an Open3D trajectory.json: write one of these; otherwise the camera is tracked.",
         )
     if not has_camera and (found := _like(_CAMERA, contents)):
         yield Finding(

@@ -1,10 +1,10 @@
 """Procedural tables: dining, coffee and side tables, desks, trestles, pedestals and many more.
 
-A table is drawn in the order of its modules: `tops`, `bases` (what carries a top), `storage`
-(drawers, shelves, what stands on a desk), `family` (styles, frequencies, sizes).
+A table is drawn in the order of its modules: `tops`, `bases` (legs and pedestals of a top),
+`storage` (drawers, shelves, attachments of desks), `family` (styles, frequencies, sizes).
 
-The canonical frame is that of the chairs: +y up, box centred at the origin. The long side of a top
-lies along x. A table that has a front, as a desk with its drawers and the place of its sitter,
+The canonical frame is the same as for chairs: +y up, box centred at the origin. The long side of a
+top lies along x. A table that has a front, as a desk with its drawers and the place of its sitter,
 turns it to +z; most others look the same from both long sides, square and round ones from all four.
 """
 

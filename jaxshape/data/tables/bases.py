@@ -1,4 +1,4 @@
-"""What carries a table top: end frames and trestles, pedestals, panels, and the legs of chairs."""
+"""Bases of table tops: end frames and trestles, pedestals, panels, and the legs of chairs."""
 
 from collections.abc import Sequence
 
@@ -67,7 +67,7 @@ def _trestle(draw: Draw, top: Board) -> list[Part]:
 
 
 def frames(draw: Draw, top: Board, kinds: Weights, *, beam: Number = 0.3) -> list[Part]:
-    """The same flat frame at both ends, and with the chance `beam` a beam between the two."""
+    """The same flat frame at both ends; a beam connects them with probability `beam`."""
     kind = draw.named("frame", kinds)
     under = corners(top)
     thick, wide = draw.thick(0.025, 0.06), draw.between(0.02, 0.11)
@@ -88,7 +88,7 @@ Line = tuple[tuple[Number, Number], tuple[Number, Number]]
 """A bar of an end frame from one (y, z) to another."""
 
 Frame = tuple[Sequence[Line], Number]
-"""The bars of an end frame, and the height at which a beam meets one of them at z = 0."""
+"""The bars of an end frame, and the height at which a beam meets a bar at z = 0."""
 
 
 def _loop(draw: Draw, half: Number, y: Number, thick: Number) -> Frame:
@@ -129,7 +129,7 @@ def _trestle_legs(draw: Draw, half: Number, y: Number, thick: Number) -> Frame:
 
 
 def _tee(draw: Draw, half: Number, y: Number, thick: Number) -> Frame:
-    """One column between a foot and a bearer."""
+    """A column between a foot and a bearer."""
     bearer, low, top = half * draw.between(0.5, 1.0), thick / 2, y - thick / 2
     lines = [((y, 0), (low, 0)), ((low, -half), (low, half)), ((top, -bearer), (top, bearer))]
     return lines, y * draw.between(0.15, 0.95)
@@ -148,7 +148,7 @@ _LINES = {"loop": _loop, "arch": _arch, "X": _cross, "A": _trestle_legs, "T": _t
 
 
 def pedestal(draw: Draw, top: Board) -> list[Part]:
-    """One foot in the middle: of an inn, a tulip, a turned column, a drum, crossing boards."""
+    """A single central foot: an inn table's, a tulip, a turned column, a drum, crossing boards."""
     kind = draw.named("pedestal", {"disc": 0.22, "star": 0.18, "claw": 0.2, "tulip": 0.12,
                                    "cone": 0.12, "boards": 0.08, "post": 0.08})  # fmt: skip
     size = min(top.width, top.depth)
@@ -221,7 +221,7 @@ _PEDESTALS = {"claw": _claw, "tulip": _tulip, "cone": _cone, "boards": _boards, 
 
 
 def _two_pedestals(draw: Draw, top: Board) -> list[Part]:
-    """The same pedestal under either half of a long top, maybe tied by a beam."""
+    """The same pedestal under each half of a long top, sometimes joined by a beam."""
     x = top.width * draw.between(0.22, 0.32)
     one = pedestal(draw, top._replace(width=min(top.depth * 1.1, top.width * 0.5)))
     parts = [shift(part, (s * x, 0, 0)) for part in one for s in (-1, 1)]

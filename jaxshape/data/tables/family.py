@@ -109,7 +109,7 @@ def _desk(draw: Draw) -> list[Part]:
 
 
 def _end_of_desk(draw: Draw, top: Board, end: int, kind: str, x: float, wide: float) -> list[Part]:
-    """What carries one end of a desk: end 1 is at +x, end -1 at -x."""
+    """The support of one end of a desk: end 1 is at +x, end -1 at -x."""
     y, z = top.height - top.thickness, top.depth / 2
     if kind == "cabinet":
         low, high = sorted((end * x, end * (x - wide)))
@@ -129,7 +129,7 @@ def _end_of_desk(draw: Draw, top: Board, end: int, kind: str, x: float, wide: fl
 
 
 def _corner_desk(draw: Draw) -> list[Part]:
-    """An L: a desk whose second board runs forward at one end."""
+    """An L-shaped desk: a second board runs forward at one end."""
     top = draw_top(draw, width=(1.3, 1.9), depth=(0.5, 0.75), height=(0.7, 0.78),
                    outlines={"rectangle": 1.0})  # fmt: skip
     wide, long = draw.between(0.4, 0.65), draw.between(0.4, 1.1)
@@ -399,7 +399,7 @@ def random_table(seed: int | np.integer, *, style: str | None = None) -> trimesh
     """Make the procedural table of a seed. [host]
 
     Args:
-        seed: Seed of the table, 0 or more; those from 1,000,000 on are kept for tests.
+        seed: Seed of the table, 0 or more; seeds from 1,000,000 on are kept for tests.
         style: One of the styles of `jaxshape.data.tables.STYLES`; None to draw one by its
             frequency.
 
@@ -409,6 +409,6 @@ def random_table(seed: int | np.integer, *, style: str | None = None) -> trimesh
         holds `style`, `seed` and `drawn`, the named choices (outline, top, base, ...).
 
     Raises:
-        ValueError: The seed is negative, or there is no such style.
+        ValueError: The seed is negative, or the style is unknown.
     """
     return make(TABLES, seed, style)

@@ -1,4 +1,4 @@
-"""What a table holds: shelves, drawers under the top, the cabinets and shelves of desks."""
+"""Storage in tables: shelves, drawers under the top, the cabinets and shelves of desks."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from jaxshape.data.tables.tops import inside
 def shelf(draw: Draw, top: Board, share: Number | None = None) -> list[Part]:
     """A shelf between the legs at a share of their height, of one board or of slats.
 
-    `top` is as large as what the legs stand under.
+    `top` has the size of the board above the legs.
     """
     share = draw.between(0.12, 0.5) if share is None else share
     under = inside(top, draw.between(0.96, 1.0))
@@ -35,7 +35,8 @@ def drawers_under(draw: Draw, top: Board) -> list[Part]:
 
 
 def _fronts(draw: Draw, x: Range, y: Range, z: Number, grid: tuple[int, int]) -> list[Part]:
-    """Drawer fronts on the face of a case at z, `grid` of them across and upward, with handles."""
+    """Drawer fronts with handles on the face of a case at z; `grid` is their number across and
+    upward."""
     across, upward = grid
     out, gap = draw.between(0.006, 0.02), draw.between(0.006, 0.02)
     wide, high = (x[1] - x[0]) / across, (y[1] - y[0]) / upward
@@ -89,7 +90,7 @@ def case(draw: Draw, x: Range, y: Range, deep: Number, *, shelves: int) -> list[
 
 
 def riser(draw: Draw, top: Board) -> list[Part]:
-    """What stands at the back of a desk's top: shelves, a low gallery, a screen or a mirror."""
+    """Attachments at the back of a desk's top: shelves, a low gallery, a screen or a mirror."""
     kind = draw.named("riser", {"shelves": 0.5, "gallery": 0.25, "screen": 0.15, "mirror": 0.1})
     wide, back = top.width * draw.between(0.8, 1.0), -top.depth / 2
     if kind == "mirror":

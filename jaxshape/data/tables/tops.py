@@ -47,7 +47,7 @@ def inside(top: Board, share: Number) -> Board:
 
 
 def corners(top: Board) -> Board:
-    """The board whose corners lie under the top: smaller than the top where that is round."""
+    """The rectangle whose corners lie under the top; smaller than a round top."""
     return inside(top, 0.8) if is_round(top) else top
 
 

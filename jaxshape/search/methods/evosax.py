@@ -138,13 +138,13 @@ def evosax_strategy(
         points = (state.origin + sigma0 * units).astype(state.origin.dtype)
         losses = jax.vmap(objective)(points)
         ranked = _worst_if_failed(losses).astype(units.dtype)
-        told, _ = strategy.tell(tell_key, units, ranked, asked, params)
-        mean = told.mean.mean(axis=0) if populations else told.mean
+        updated, _ = strategy.tell(tell_key, units, ranked, asked, params)
+        mean = updated.mean.mean(axis=0) if populations else updated.mean
         state = state._replace(
             mean=(state.origin + sigma0 * mean).astype(state.origin.dtype),
             best=keep_better(state.best, points, losses),
             evaluations=state.evaluations + len(points),
-            strategy_state=cast_like(told, state.strategy_state),
+            strategy_state=cast_like(updated, state.strategy_state),
         )
         return state, summarise(state.best, points, losses, state.evaluations)
 

@@ -213,7 +213,7 @@ def _odd(gltf):
     ("damage", "said"),
     [
         (_cut, "beyond its buffer"),
-        (_circle, "children of their own"),
+        (_circle, "their own descendants"),
         (_two_parents, "child of two nodes"),
         (_no_data, "no data"),
         (_odd, "11 corners"),

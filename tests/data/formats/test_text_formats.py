@@ -94,7 +94,7 @@ def test_strips_of_a_ply_file_are_triangles():
     [
         (HEADER.format("patch") + "3 0 1 2\n", NotSupported, "'patch'"),
         (HEADER.format("face") + "3 0 1\n", Unreadable, "ends before"),
-        (HEADER.format("face") + "3 0 1 2 3 0 1 3\n", Unreadable, "does not speak of"),
+        (HEADER.format("face") + "3 0 1 2 3 0 1 3\n", Unreadable, "does not mention"),
         (HEADER.format("face") + "3 0 1 9\n", Unreadable, "does not hold"),
         (HEADER.replace("float z", "tensor z").format("face"), Unreadable, "not understood"),
     ],

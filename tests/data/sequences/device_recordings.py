@@ -19,7 +19,7 @@ NOWHERE = np.eye(4)
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class Shot(NamedTuple):
+class DeviceFrame(NamedTuple):
     depth: np.ndarray
     color: np.ndarray
     mask: np.ndarray
@@ -44,7 +44,7 @@ def shoot(count=5, zoom=0.0):
         for k, T in zip(K, seen.T_world_camera, strict=True)
     ]
     depth = np.rint(np.stack(depth) * 1000) / 1000
-    return Shot(depth, seen.color, seen.mask, seen.T_world_camera, K)
+    return DeviceFrame(depth, seen.color, seen.mask, seen.T_world_camera, K)
 
 
 def write_scannet(folder, seen):

@@ -1,1 +1,1 @@
-"""Layouts of recordings, a file for each kind: whether a folder is one, and what it holds."""
+"""Layouts of recordings, a file for each kind, which recognises a folder and lists its frames."""

@@ -1,4 +1,4 @@
-"""One `.npz` file of arrays: depth, and perhaps colour, cameras, poses, masks and times."""
+"""A single `.npz` file of arrays: depth, and optionally colour, cameras, poses, masks and times."""
 
 from pathlib import Path
 

@@ -32,8 +32,8 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`depth/`, `rgb/` or `gray/`, `scene_camera.json`, and perhaps `scene_gt.json` with masks.
 
-    Each image has its own camera and its own unit of depth. The world is that of `cam_R_w2c`, if
-    every image has one, else the frame of the object that most images show.
+    Each image has its own camera and its own unit of depth. The world frame comes from `cam_R_w2c`
+    if every image has one; otherwise it is the frame of the object that most images show.
     """
     source = contents.folder / "scene_camera.json"
     about = read_json_object(source)
@@ -116,7 +116,7 @@ def _instance(truth: dict[str, Any]) -> tuple[Instance | None, tuple[Finding, ..
         return chosen, ()
     return chosen, (
         Finding(
-            f"the scene holds {len(shown)} objects; masks and object poses are those of object "
+            f"the scene holds {len(shown)} objects; masks and object poses belong to object "
             f"{chosen[0]}, which most images show",
             "For another one, take away the folders mask_visib and mask, and --click it.",
         ),

@@ -52,7 +52,7 @@ def list_redwood(contents: Contents) -> Listed:
     """Object scans (Choi et al., 2016): `depth/N-TIME.png`, `rgb/N-TIME.jpg`, microseconds.
 
     The streams are not synchronised: each depth image gets the colour image nearest in time. There
-    are no poses, unless someone put a trajectory beside the folders.
+    are no poses, unless a trajectory lies next to the folders.
     """
     depth, offered = depth_images(contents), color_images(contents)
     offered = {name: path for name, path in offered.items() if _STAMPED.fullmatch(name)}
@@ -177,7 +177,7 @@ def _trajectory_poses(contents: Contents, count: int) -> PoseReader | None:
 
 
 def _find_trajectory(contents: Contents) -> Path | None:
-    """The `.log` or `.json` that holds poses, those first that are called trajectory."""
+    """The `.log` or `.json` that holds poses; files called trajectory come first."""
 
     def order(name: str) -> tuple[bool, str]:
         return "traj" not in name.lower(), name
@@ -200,7 +200,7 @@ def _is_log(path: Path) -> bool:
 
 
 def _is_json_trajectory(path: Path) -> bool:
-    if "traj" in path.name.lower():  # if it is none, its reader says what is wrong with it
+    if "traj" in path.name.lower():  # if it is no trajectory, its reader says why
         return True
     try:
         return "parameters" in reading.read_json_object(path)

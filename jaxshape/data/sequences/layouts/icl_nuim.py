@@ -18,7 +18,7 @@ from jaxshape.data.sequences.poses import known
 
 _CAMERA = (481.2, 480.0, 319.5, 239.5)
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-"""The poses are of the renderer's frames, whose y points up in the camera and in the world."""
+"""The poses use the renderer's frames: y points up in the camera and in the world."""
 
 
 def fits(contents: Contents) -> bool:

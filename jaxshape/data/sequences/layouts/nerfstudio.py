@@ -78,7 +78,7 @@ def _frames(about: dict[str, Any], source: Path) -> list[dict[str, Any]]:
         raise SequenceError(f"{source} holds no list of frames; write it again.")
     for name in (one.get("file_path") for one in frames):
         if name is not None:
-            below(source.parent, name, source)  # refuses what is none
+            below(source.parent, name, source)  # refuses a matrix that is no pose
     return frames
 
 
@@ -91,7 +91,7 @@ def _order(frame: dict[str, Any]) -> tuple[tuple[int, ...], str]:
 
 
 def _depth_of(contents: Contents, frames: list[dict[str, Any]], source: Path) -> list[Path | None]:
-    """The depth image of each frame: the named one, or that of the same name or number."""
+    """The depth image of each frame: the named one, or the one with the same name or number."""
     if any(frame.get("depth_file_path") for frame in frames):
         named = [frame.get("depth_file_path") for frame in frames]
         return [below(contents.folder, name, source) if name else None for name in named]
@@ -131,7 +131,7 @@ def _depth_scale(about: dict[str, Any], files: list[FrameFiles], source: Path) -
 def _calibration(
     about: dict[str, Any], frames: list[dict[str, Any]], files: list[FrameFiles], source: Path
 ) -> Calibration:
-    """The camera of each frame, whose entries go before those of the whole file."""
+    """The camera of each frame; its entries take precedence over those of the whole file."""
     entries = [{name: one.get(name, about.get(name)) for name in _CAMERA} for one in frames]
     shape = _shape(entries, files, source)
     numbers = np.array([_numbers(entry, shape, source) for entry in entries])

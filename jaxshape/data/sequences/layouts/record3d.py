@@ -51,7 +51,7 @@ def list_frames(contents: Contents) -> Listed:
     """`depth/N.exr` in metres, `rgb/N.jpg`, and `metadata.json` with poses and cameras by frame.
 
     Poses are quaternion and place, camera to world, with ARKit's axes: y up, z backwards. Cameras
-    are of the colour images, whose size the metadata give.
+    belong to the colour images, whose size is in the metadata.
     """
     if _packed(contents) and not has_depth_folder(contents):
         raise SequenceError(f"{contents.folder} {_PACKED}")

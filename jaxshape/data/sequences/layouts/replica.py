@@ -55,7 +55,7 @@ def list_frames(contents: Contents) -> Listed:
     """`results/depthN.png` and `results/frameN.jpg`, or `depth/` and `rgb/`, and `traj.txt`.
 
     Line i of `traj.txt` is the camera to world, by rows, of the i-th image. The camera and the
-    depth scale are those of `cam_params.json`, here or in the parent folder, where it lies there.
+    depth scale come from `cam_params.json`, here or in the parent folder.
     """
     if "results" in contents.folders:
         every = files_in(contents, ("results",), COLOR_SUFFIXES + DEPTH_SUFFIXES)

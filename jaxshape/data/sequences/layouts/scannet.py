@@ -22,8 +22,9 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`depth/N.png` in millimetres, `color/N.jpg`, `pose/N.txt`, `intrinsic/intrinsic_depth.txt`.
 
-    Poses are camera to world, of -inf where tracking was lost. The colour camera is larger and a
-    few millimetres beside the depth camera, to which the colours are taken as registered.
+    Poses are camera to world, of -inf where tracking was lost. The colour camera has more pixels
+    and lies a few millimetres from the depth camera; the colours are taken as registered to the
+    depth images.
     """
     depth = depth_images(contents)
     poses = partners(depth, files_in(contents, ("pose", "poses"), (".txt",)))

@@ -15,7 +15,8 @@ def fits(contents: Contents) -> bool:
 
 
 def list_frames(contents: Contents) -> Listed:
-    """`frame-N.depth.png`, and beside it `.pose.txt`, `.color.png` or `.jpg`, and `.mask.png`."""
+    """`frame-N.depth.png` with `.pose.txt`, `.color.png` or `.jpg`, and `.mask.png` of the same
+    name."""
     folder, present = contents.folder, contents.files
     numbers: dict[str, set[str]] = {"depth.png": set(), "pose.txt": set()}
     for match in filter(None, map(_NAME.fullmatch, present)):

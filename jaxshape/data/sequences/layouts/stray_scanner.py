@@ -103,7 +103,7 @@ def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
 def _calibration(
     contents: Contents, columns: dict[str, np.ndarray], rows: list[int], color: list[Path | None]
 ) -> Calibration | None:
-    """The camera of each frame, or else that of all, both of the film's size."""
+    """The camera of each frame, otherwise the common camera; both for images of the film's size."""
     images = [path for path in color if path]
     shape = read_shape(images[0]) if images else _FILM
     own = [columns[name][rows] for name in _OWN_CAMERA if name in columns]

@@ -34,10 +34,10 @@ def fits(contents: Contents) -> bool:
 
 
 def list_frames(contents: Contents) -> Listed:
-    """`depth.txt`, and perhaps `rgb.txt` and `groundtruth.txt`, whose clocks are the same.
+    """`depth.txt`, and optionally `rgb.txt` and `groundtruth.txt`, with the same clock.
 
-    Each depth image gets the colour image nearest in time, and the pose between those before and
-    after it.
+    Each depth image gets the colour image nearest in time, and a pose interpolated between the
+    poses before and after it.
     """
     folder = contents.folder
     times, depth = _read_list(folder / "depth.txt")
