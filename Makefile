@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo docs paper test test-slow fuzz kills audit lowest wheel lint clean
+.PHONY: install demo docs notebooks paper test test-slow fuzz kills audit lowest wheel lint clean
 
 install: $(VENV)/.runtime
 
@@ -89,6 +89,15 @@ lowest: $(VENV)/.develop
 docs: $(VENV)/.runtime
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
+# The notebooks of docs/notebooks as .ipynb files, into out/notebooks.
+notebooks: $(VENV)/.runtime
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	mkdir -p out/notebooks
+	for script in docs/notebooks/*.py; do \
+		$(BIN)/python -m jupytext --quiet --from py:percent --to ipynb $$script \
+			--output out/notebooks/$$(basename $$script .py).ipynb || exit 1; \
+	done
 
 # Built, installed into a fresh environment, and tried from an empty folder.
 wheel: $(VENV)/.runtime

@@ -17,4 +17,5 @@ def test_the_reference_holds_every_public_name_once():
 def test_every_page_is_in_the_navigation():
     navigation = (DOCS.parent / "mkdocs.yml").read_text().split("\nnav:")[1]
     pages = {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}
+    pages |= {f"notebooks/{path.stem}.md" for path in (DOCS / "notebooks").glob("*.py")}
     assert set(re.findall(r"[\w/]+\.md", navigation)) == pages
