@@ -4,8 +4,8 @@ r"""The frozen problems of `jaxshape bench` (beyond the paper).
 
 16 procedural chairs from seeds kept for tests and 8 CAD seats whose licence is CC0, each seen by 1,
 4 and 8 frames of an orbit at 30 degrees elevation: clean (the paper's camera, points) and with a
-Kinect's noise (signed distances). The lowest objective known of a problem is what 400 steps of Adam
-from the encoder's code reach, with a step size that falls to zero along a cosine.
+Kinect's noise (signed distances). The lowest known objective of a problem is the result of 400
+steps of Adam from the encoder's code, with a step size that decays to zero along a cosine.
 
 Writes jaxshape-bench-1.npz, the same bytes wherever it runs with the same versions, and
 jaxshape-bench-1.json. The set is frozen: this script is kept to show how it was made. Problems that
@@ -54,17 +54,17 @@ SEATS = (
     "blendswap_cc_0_deckchair_deckchair",
     "blendswap_cc_0_osakachair_osakachair",
 )
-"""CAD seats by their names in the list; all of them are CC0."""
+"""CAD seats by their names in the list; all are under CC0."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Where from, and where to."""
+    """Sources and output."""
 
     meshes: Path = Path("cad_chairs")
     """Folder of the CAD seats, as experiments/cad_seats.py writes it."""
     output: Path = Path("out/bench_set")
-    """Folder for the two files, and for what was searched already."""
+    """Folder for the two files, and for finished searches."""
     steps: int = 400
     """Steps of Adam."""
     at_a_time: int = 8
@@ -81,7 +81,7 @@ def main(config: Config) -> None:
 
 
 def items(meshes: Path) -> list[tuple[Object, dict[str, str]]]:
-    """The objects, two procedural chairs before each seat, with what is to be told of them."""
+    """The objects with their metadata, two procedural chairs before each seat."""
     files = {source.name: source for source in list_meshes(meshes)}
     listed = {seat["name"]: seat for seat in json.loads(LIST.read_text(encoding="utf-8"))}
     found = []

@@ -10,11 +10,11 @@ Debian's `sweethome3d-furniture` 1.8-1 (any release that has it, or packages.deb
 seats and 52 tables in furniture catalogues, whose rotations and sizes are applied; npm's
 `open3dfloorplan` holds 11 and 10 of Kenney's Furniture Kit. experiments/cad_seats.json and
 cad_tables.json list which they are, of what kind, who made them and under which licence (CC0 or
-CC-BY: name the creator). The tables are all that the packages hold, desks and night stands
-among them, but for copies of the same mesh in another material.
+CC-BY: name the creator). The tables are all tables of the packages, including desks and night
+stands, without copies of a mesh in another material.
 
 Writes a folder of PLY files in the canonical frame (metres, +y up, front along +z, centred) and
-manifest.json, which says of each what the list does. No model is trained on them. Time: 20 seconds.
+manifest.json, which repeats the entries of the list. No model is trained on them. Time: 20 seconds.
 """
 
 import json
@@ -39,18 +39,18 @@ SIZE_TOLERANCE = 0.002
 
 @dataclass(frozen=True)
 class Config:
-    """Where from, and where to."""
+    """Sources and output."""
 
     packages: Path = Path("packages")
     """The folder both packages were unpacked in: it has `usr/` and `package/`."""
     output: Path = Path("cad_chairs")
     """Folder to write."""
     list: Literal["seats", "tables"] = "seats"
-    """What to write."""
+    """List of furniture to write."""
 
 
 class Piece(NamedTuple):
-    """One piece of furniture of a list."""
+    """A piece of furniture of a list."""
 
     name: str
     kind: str
@@ -65,7 +65,7 @@ class Piece(NamedTuple):
     member: str | None
     """Inside the file, where that is a catalogue."""
     size: list[float]
-    """Along x, y, z in metres, by which another version is told."""
+    """Size along x, y, z in metres, which identifies the version."""
 
 
 def main(config: Config) -> None:
@@ -91,7 +91,7 @@ def collect(pieces: Sequence[Piece], packages: Path, output: Path) -> None:
 
 
 def read_piece(piece: Piece, packages: Path) -> Model:
-    """One piece in the canonical frame, as its catalogue turns and scales it."""
+    """A piece in the canonical frame, as its catalogue turns and scales it."""
     source = _sources(packages / piece.file).get(piece.member)
     found = None if source is None else load(source)
     if found is None or isinstance(found, Skipped):
@@ -113,7 +113,7 @@ def read_piece(piece: Piece, packages: Path) -> Model:
 
 @cache
 def _sources(file: Path) -> dict[str | None, MeshSource]:
-    """The meshes of a file by member; none where there is no such file."""
+    """The meshes of a file by member; none if the file is missing."""
     return {source.member: source for source in list_meshes(file)} if file.is_file() else {}
 
 

@@ -3,13 +3,13 @@ r"""Objective and IoU along the search: CMA-ES, gradient descent and Adam (paper
     python experiments/convergence.py --test.meshes cad_chairs/
 
 16 procedural chairs and 12 CAD seats, each seen in 4 frames. Every search starts from the encoder's
-code and takes all 350 iterations of the paper: CMA-ES and gradient descent with the steps that
-step_size.py finds best and with those of the paper (in the codes themselves, sigma0 = 2 and steps
-of 0.14), and Adam. The objective is the best so far; a thin line is what CMA-ES draws, the best of
-each iteration alone. Both are drawn against the start, where chairs differ most: means over chairs
-with their 95 % intervals by bootstrap.
+code and takes all 350 iterations of the paper. CMA-ES and gradient descent run with the best steps
+of step_size.py and with the paper's (sigma0 = 2 and steps of 0.14 in the codes themselves); Adam
+runs once. The figure shows the lowest objective so far, and as a thin line the best candidate of
+each iteration of CMA-ES. Objectives are relative to the start, where chairs differ most: means over
+chairs with their 95 % intervals by bootstrap.
 
-Results: experiments/results/convergence.json, .png and .svg; chairs that are done are kept.
+Results: experiments/results/convergence.json, .png and .svg; finished chairs are kept.
 Time: 15 minutes on two cores.
 """
 
@@ -69,14 +69,14 @@ class Config:
     frames: int = 4
     """Number of frames that are fused."""
     iterations: int = 350
-    """Of every search, none of which stops before."""
+    """Iterations of every search; none stops earlier."""
     early: int = 60
-    """Iterations that the other experiments make do with."""
+    """Iterations of the other experiments."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
@@ -88,7 +88,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Follow every search on every chair, and write what was found."""
+    """Follow every search on every chair, and write the results."""
     prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
@@ -120,7 +120,7 @@ def sampled(config: Config, count: int) -> list[int]:
 
 
 def along(method: str, how: RefineConfig, prior: ShapePrior, config: Config) -> Contestant:
-    """The contestant that reports of all of its search, at some iterations."""
+    """The contestant that reports its whole search, at some iterations."""
     how = replace(how, iterations=config.iterations, tolerance=0.0)
     refiner = refiner_for(method, prior, how)
     often, seldom = (jnp.array(sampled(config, n)) - 1 for n in (30, 12))
@@ -156,7 +156,8 @@ def iou_of(
 def fluctuation(
     drawn: Float[Array, "case iteration"], taken: Int[Array, " case"]
 ) -> dict[str, Float[Array, " case"]]:
-    """How often the loss of an iteration is above that before, and how much of its way is uphill.
+    """Share of iterations whose loss is above the previous one, and the uphill share of all
+    changes.
 
     `rises` is a share of the iterations that were taken, `uphill` of all changes of the loss: 0 for
     losses that never go up, and a half for those that go up as much as down.
@@ -195,7 +196,7 @@ def summary(journal: Journal, config: Config) -> dict[str, Any]:
 
 
 def claims(journal: Journal, config: Config) -> list[Claim]:
-    """What the paper says of this figure, and what is found here, over the chairs of all groups."""
+    """The paper's claims about this figure, and our findings over the chairs of all groups."""
     early = sampled(config, 30).index(config.early)
     early_iou = sampled(config, 12).index(config.early)
 
@@ -208,20 +209,20 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         return scores(name, score)[:, -1]
 
     def lower(name: str) -> np.ndarray:
-        """By how much CMA-ES ends below another search."""
+        """Final objective of another search minus that of CMA-ES."""
         return last(name, "best") - last("CMA-ES", "best")
 
     def higher(name: str) -> np.ndarray:
         return last("CMA-ES", "iou") - last(name, "iou")
 
     def fall(name: str, at: int = -1) -> float:
-        """As a share of that of the search that ends lowest."""
+        """Decrease as a share of the largest decrease of all searches."""
         start = scores(name, "start").mean()
         lowest = min(last(other, "best").mean() for other in SEARCHES)
         return float((start - scores(name, "best")[:, at].mean()) / (start - lowest))
 
     def part(name: str) -> str:
-        """What of its own fall, and of its gain in IoU, a search has done early."""
+        """Shares of the decrease and of the gain in IoU that a search reaches early."""
         start, best = scores(name, "start").mean(), scores(name, "best").mean(axis=0)
         first, found = scores(name, "start_iou").mean(), scores(name, "iou").mean(axis=0)
         ways = (

@@ -3,15 +3,15 @@ r"""Searches at equal cost, and whether a lower objective is a better shape (not
     python experiments/equal_budget.py --test.meshes cad_chairs/
 
 Every search starts from the encoder's code and may spend the same number of decoder calls. A
-candidate is one call; a gradient, a pass forward and one back, is measured to take as long as three
-and counts as three, and so does each evaluation of a line search, which asks for gradients too.
-IoU and objective are those of the best code found within a number of calls. Seconds are those of a
-batch of eight chairs, shared out evenly over chairs and calls. IPOP stands for BIPOP as well: up to
-its first restart either is CMA-ES. Steps and sigma0 are those that step_size.py finds best.
+candidate is one call. A gradient, a forward and a backward pass, takes the measured time of three
+calls and counts as three; so does each evaluation of a line search, which needs gradients too. IoU
+and objective belong to the best code found within a number of calls. Seconds are measured for a
+batch of eight chairs and divided evenly over chairs and calls. IPOP stands for BIPOP as well: both
+equal CMA-ES up to the first restart. Steps and sigma0 are the best values of step_size.py.
 
 8 procedural chairs and 8 CAD seats, seen by 4 frames as iou_by_frames.py sees them.
 
-Results: experiments/results/equal_budget.json, .png and .svg; chairs that are done are kept.
+Results: experiments/results/equal_budget.json, .png and .svg; finished chairs are kept.
 Time: 16 minutes on two cores.
 """
 
@@ -77,14 +77,14 @@ class Config:
     test: TestSet = TestSet(chairs=8, seats=8)
     frames: int = 4
     budgets: tuple[int, ...] = (32, 64, 128, 256, 512, 768, 1024, 1536, 2048)
-    """Decoder calls after which shapes are scored; the last is what every search may spend."""
+    """Decoder calls after which shapes are scored; the last is the budget of every search."""
     searches: tuple[str, ...] = tuple(DRAWN)
-    """Those to compare, CMA-ES among them."""
+    """Searches to compare, including CMA-ES."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few calls: does it run?"""
+    """Two procedural chairs and few calls, as a test."""
 
 
 def main(config: Config) -> None:
@@ -97,7 +97,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Give every search its budget on every chair, and write what was found."""
+    """Give every search its budget on every chair, and write the results."""
     prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
@@ -124,7 +124,7 @@ class Search(NamedTuple):
 
     refiner: Refiner
     iterations: int
-    """As many as the budget can pay for."""
+    """Iterations that the budget allows."""
     candidates: int
     """Evaluations at its beginning that need no gradient."""
     space: Literal["whitened", "raw"]
@@ -136,7 +136,7 @@ class Search(NamedTuple):
 
 
 def searches(prior: ShapePrior, budget: int) -> dict[str, Search]:
-    """All that are compared, each with `budget` decoder calls."""
+    """All compared searches, each with `budget` decoder calls."""
 
     def built(method: str, **settings: Any) -> Refiner:
         return build_refiner(method, len(prior.code_mean), RefineConfig(**settings))
@@ -220,7 +220,7 @@ def _after(
     return values[jnp.arange(len(values))[:, None], iterations]
 
 
-# ------------------------------------------------------------------ what the rows say
+# ------------------------------------------------------------------ evaluation of the rows
 
 
 def curve(journal: Journal, config: Config, group: str, name: str, score: str) -> np.ndarray:
@@ -244,7 +244,7 @@ def shared_seconds(journal: Journal, config: Config) -> float:
 def at_time(
     journal: Journal, config: Config, group: str, name: str, score: str, seconds: float
 ) -> np.ndarray:
-    """A score by chair after some seconds, between those of the budgets."""
+    """A score by chair after some seconds, interpolated between budgets."""
     calls = seconds / seconds_per_call(journal, config, name)
     curves = curve(journal, config, group, name, score)
     return np.array([np.interp(calls, (0, *config.budgets), values) for values in curves])
@@ -272,7 +272,7 @@ def agreement(
 
 
 def last_half(journal: Journal, config: Config, group: str, name: str, score: str) -> np.ndarray:
-    """What the second half of the budget changes, by chair."""
+    """The change in the second half of the budget, by chair."""
     middle = 1 + int(np.searchsorted(config.budgets, config.budgets[-1] / 2))
     values = curve(journal, config, group, name, score)
     return values[:, -1] - values[:, middle]
@@ -318,7 +318,7 @@ def summary(journal: Journal, config: Config) -> dict[str, Any]:
 
 
 def claims(journal: Journal, config: Config) -> list[Claim]:
-    """What the paper says, and what it did not ask, over the chairs of all groups."""
+    """Claims of the paper, and further ones, over the chairs of all groups."""
     budget, whole = config.budgets[-1], shared_seconds(journal, config)
 
     def pooled(values: Callable[[str], np.ndarray]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What the figures of the experiments share: size, lines for searches, means with intervals.
+"""Common parts of the figures of the experiments: size, lines for searches, means with intervals.
 
 Lines differ in their dashes as well as in their colours.
 """
@@ -25,7 +25,7 @@ LINES: dict[str, dict[str, Any]] = {
     "F, occluded empty": {"color": GREY, "dashes": ()},
     "F, occluded full": {"color": GREY, "dashes": (2, 2)},
 }
-"""How the same thing is drawn in every figure."""
+"""Line of each search or bound, the same in every figure."""
 
 
 def interval(samples: Num[np.ndarray, "n ..."]) -> Float[np.ndarray, "2 ..."]:

@@ -2,11 +2,11 @@ r"""What is measured, proposed, refined and true, by number of frames (paper, Fi
 
     python experiments/gallery.py --test.meshes cad_chairs/
 
-Six chairs after 1 to 18 frames of an orbit: F with M as a fog around it, the encoder's answer, that
-of CMA-ES after 60 iterations, the composed shape and the truth. In the refined shapes, true voxels
-that the encoder had missed are dark. No chair is chosen for its beauty: of the first 16 procedural
-and the first 16 CAD chairs of the test set, those whose gain of IoU from encoder to CMA-ES, at 4
-frames, is nearest to the 25th, 50th and 75th percentile of their group.
+Six chairs after 1 to 18 frames of an orbit: F with M as a fog around it, the encoder's shape, the
+shape of CMA-ES after 60 iterations, the composed shape and the truth. In the refined shapes, true
+voxels that the encoder had missed are dark. The chairs are chosen by rule: among the first 16
+procedural and the first 16 CAD chairs of the test set, the ones whose gain of IoU from encoder to
+CMA-ES, at 4 frames, is nearest to the 25th, 50th and 75th percentile of their group.
 
 Results in experiments/results: gallery.json (who made the CAD seats, IoU of every picture),
 gallery.png and .svg, and headline.png and .svg (the two medians after 1, 4 and 18 frames).
@@ -58,22 +58,22 @@ class Config:
     choose_at: int = 4
     """Number of frames at which the gain decides which chairs are shown."""
     iterations: int = 60
-    """Of CMA-ES (paper: 350)."""
+    """Iterations of CMA-ES (paper: 350)."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 class Shown(NamedTuple):
-    """One chair after each number of frames."""
+    """A chair after each number of frames."""
 
     chair: Subject
     percentile: int
-    """Of its gain, among its group."""
+    """Percentile of its gain in its group."""
     frames: tuple[int, ...]
-    """The rows of the case and of what was found."""
+    """Index of the rows of the case and of the results."""
     case: Case
     found: Reconstruction
 
@@ -91,7 +91,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> tuple[Journal, list[Shown]]:
-    """Choose the chairs, rebuild them after each number of frames, and write what was found.
+    """Choose the chairs, rebuild them after each number of frames, and write the results.
 
     No chairs are returned where the results of these settings are there, with their pictures.
     """
@@ -134,7 +134,8 @@ def _by_group(test: TestSet) -> dict[str, list[Subject]]:
 
 
 def at_percentiles(values: Sequence[float]) -> dict[int, int]:
-    """Which value is nearest to each percentile, each value for the middle one it can serve."""
+    """Index of the value nearest to each percentile; a value that is nearest to several serves the
+    middle one."""
     order = np.argsort(values)
     places = {p: round(p / 100 * (len(order) - 1)) for p in (50, *PERCENTILES)}
     chosen: dict[int, int] = {}
@@ -147,7 +148,7 @@ def at_percentiles(values: Sequence[float]) -> dict[int, int]:
 def rebuild(
     chairs: Sequence[Subject], frames: Sequence[int], prior: ShapePrior, search: RefineConfig
 ) -> list[tuple[Subject, Case, Reconstruction]]:
-    """Each chair with what is seen of it and rebuilt, after each number of frames."""
+    """Each chair with its measurement and reconstruction, after each number of frames."""
     seen = []
     for chair in chairs:
         model = load_object(chair.item)
@@ -176,7 +177,7 @@ def _gains(case: Case, found: Reconstruction) -> np.ndarray:
 
 
 def row(one: Shown) -> dict[str, Any]:
-    """What is known of one chair: its makers, and the IoU of its pictures."""
+    """The record of a chair: its makers, and the IoU of its pictures."""
     shapes = _shapes(one)
     scores = {name: np.asarray(iou(shape, one.case.surface)) for name, shape in shapes.items()}
     return {
@@ -200,7 +201,7 @@ def _shapes(one: Shown) -> dict[str, Any]:
 
 
 def credit(chair: Subject) -> str:
-    """What a chair is, who made it and under which licence."""
+    """Name, maker and licence of a chair."""
     if chair.group == "procedural":
         return f"procedural {chair.name}"
     listed = {seat["name"]: seat for seat in json.loads(CREATORS.read_text(encoding="utf-8"))}
@@ -210,7 +211,7 @@ def credit(chair: Subject) -> str:
 
 
 def claims(journal: Journal, config: Config) -> list[Claim]:
-    """What the paper says of this figure, counted over its pictures."""
+    """The paper's claims about this figure, counted over its pictures."""
     gains = np.array(
         [
             [row[str(k)]["refined"] - row[str(k)]["encoder"] for k in config.frames]
@@ -243,7 +244,7 @@ KEYS = (
 
 
 def plot(shown: Sequence[Shown], frames: Sequence[int], stem: Path) -> None:
-    """Blocks of pictures, two beside each other: rows are frames, columns as in `COLUMNS`."""
+    """Blocks of pictures, two in a row: rows are frames, columns as in `COLUMNS`."""
     side = 2 if len(shown) > 1 else 1
     cell = (WIDTH - side * LABELS - (side - 1) * GUTTER) / (side * (len(COLUMNS) - 1 + TRUTH))
     block = (
@@ -267,7 +268,7 @@ def plot(shown: Sequence[Shown], frames: Sequence[int], stem: Path) -> None:
 def _draw_block(
     figure: Any, one: Shown, frames: Sequence[int], cell: float, left: float, top: float
 ) -> None:
-    """One chair; lengths in inches from the upper left corner of the figure."""
+    """A chair; lengths in inches from the upper left corner of the figure."""
     width, height = figure.get_size_inches()
 
     def text(x: float, y: float, content: str, **style: Any) -> None:
@@ -297,7 +298,7 @@ def _draw_block(
 
 
 def _picture(one: Shown, name: str, i: int) -> np.ndarray:
-    """One cell of a block."""
+    """A cell of a block."""
     occupied, occluded, surface = (
         np.asarray(grid[i]) for grid in (*one.case.grids[:2], one.case.surface)
     )

@@ -2,19 +2,20 @@ r"""Where gradients stall and CMA-ES goes on, and the opposite cases (paper, Fig
 
     python experiments/gradient_failures.py --test.meshes cad_chairs/
 
-After 1, 4 and 8 frames, the chair on which CMA-ES leads plain descent most, by IoU, and the one on
-which it trails most (`--examples` for more): of all chairs where iou_by_frames.py has left its
-results in the same folder, else of 32 that are searched shortly here. Those are then searched by
-plain descent, Adam and CMA-ES for the paper's 350 iterations, and every search goes on for as long
-from where every other one has ended. That tells a local minimum from a slow search: in a minimum
-nothing moves but what can leave it. The straight line between two ends is followed as well: where
-the objective never rises above both, no ridge parts them.
+For 1, 4 and 8 frames, the script takes the chair on which CMA-ES leads plain descent most, by IoU,
+and the chair on which it trails most (`--examples` for more). It chooses among all chairs if
+iou_by_frames.py has left its results in the same folder, otherwise among 32 chairs that it searches
+briefly itself. Plain descent, Adam and CMA-ES then search the chosen chairs for the paper's 350
+iterations, and each search continues for as long from the end of every other one. This tells a
+local minimum from a slow search: only a search that can leave a minimum moves away from it. The
+objective is also followed along the straight line between two ends: if it never rises above both,
+no ridge separates them.
 
-Chairs that were chosen as extremes show what can happen, not how often; that is in the shares of
-all chairs.
+Extreme chairs show possible cases, not their frequency; the shares over all chairs show the
+frequency.
 
-Results: experiments/results/gradient_failures.json, and .png and .svg of those on which CMA-ES
-leads; those on which it trails are in gradient_failures_opposite. Chairs that are done are kept.
+Results: experiments/results/gradient_failures.json, and .png and .svg of the chairs on which CMA-ES
+    leads; gradient_failures_opposite has the chairs on which it trails. Finished chairs are kept.
 Time: 6 minutes on two cores after iou_by_frames.py, 8 without.
 """
 
@@ -76,16 +77,16 @@ class Config:
     examples: int = 1
     """Chairs of either kind for each number of frames."""
     iterations: int = 350
-    """Of the searches on those (paper: 350)."""
+    """Iterations of the long searches (paper: 350)."""
     candidates: int = 32
     """Chairs to choose from where iou_by_frames.py has not been run."""
     short: int = 60
     """Iterations of the searches on the candidates."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
@@ -98,7 +99,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Choose the chairs, search them long, and write what was found."""
+    """Choose the chairs, search them for long, and write the results."""
     prior = load_prior(config.weights)
     candidates = short_searches(prior, config)
     chosen = choose(candidates, config)
@@ -171,7 +172,7 @@ def choose(rows: Rows, config: Config) -> list[Example]:
 
 
 def wins(rows: Rows, frames: int) -> dict[str, dict[str, float]]:
-    """On what share of the chairs CMA-ES has the higher IoU, and its mean and extreme leads."""
+    """Share of the chairs on which CMA-ES has the higher IoU, and its mean and extreme leads."""
     found = {}
     for rival in ("gradient descent", "Adam"):
         lead = np.array(list(leads(rows, frames, rival).values()))
@@ -185,7 +186,7 @@ def wins(rows: Rows, frames: int) -> dict[str, dict[str, float]]:
 
 
 class Ends(NamedTuple):
-    """Where searches have ended."""
+    """End points of searches."""
 
     code: Float[Array, "case d"]
     objective: Float[Array, " case"]
@@ -223,7 +224,7 @@ def row_name(one: Example) -> str:
 
 
 def seen(chair: Subject, frames: int) -> Case:
-    """What the first frames show; the chair has been used before, so it can be."""
+    """The measurement of the first frames; earlier use has shown that the chair can be observed."""
     model = load_object(chair.item)
     case = None if isinstance(model, Skipped) else observe(model, replace(SEEN, frames=(frames,)))
     if case is None:
@@ -232,7 +233,7 @@ def seen(chair: Subject, frames: int) -> Case:
 
 
 def analysis(prior: ShapePrior, config: Config) -> Callable[..., dict[str, Any]]:
-    """What a row holds, from the keys and cases of a batch; each search is compiled once."""
+    """A function from the keys and cases of a batch to rows; each search is compiled once."""
     first = searcher("encoder", prior, RefineConfig())
     searches = {
         name: searcher(method, prior, replace(how, iterations=config.iterations, tolerance=0.0))
@@ -293,22 +294,22 @@ def objectives_between(
     return cross_entropy(decode(prior, codes), jax.tree.map(lambda x: x[:, None], targets))
 
 
-# ------------------------------------------------------------------ what the rows say
+# ------------------------------------------------------------------ evaluation of the rows
 
 
 def drop(row: Rows, start: str, search: str) -> float:
-    """By what share `search` lowers the objective from where `start` has ended."""
+    """Share by which `search` lowers the objective from the end of `start`."""
     return 1 - row["again"][start][search] / row["objective"][start]
 
 
 def ridge(row: Rows, rival: str) -> float:
-    """Rise on the line from the rival's end to that of CMA-ES, as a share of the higher end."""
+    """Rise on the line from the rival's end to the end of CMA-ES, as a share of the higher end."""
     line = np.array(row["line"][rival])
     return float(line.max() / max(line[0], line[-1]) - 1)
 
 
 def summary(journal: Journal) -> dict[str, Any]:
-    """What decides on each case, without codes."""
+    """The deciding figures of each case, without codes."""
     return {
         name: {
             "iou": row["iou"],
@@ -324,7 +325,7 @@ def summary(journal: Journal) -> dict[str, Any]:
 
 
 def claims(journal: Journal, shares: dict[str, Any], config: Config) -> list[Claim]:
-    """What the paper says of this figure, the opposite, and how often either happens."""
+    """The paper's claim about this figure, the opposite, and the frequency of both."""
     ahead, behind = (
         [row for row in journal.rows.values() if row["kind"] == kind] for kind in (LEADS, TRAILS)
     )
@@ -338,7 +339,7 @@ def claims(journal: Journal, shares: dict[str, Any], config: Config) -> list[Cla
 def _trapped(rows: Sequence[Rows], loser: str, winner: str, config: Config) -> Claim:
     """Has the loser ended in a local minimum that the winner leaves, or was it only slow?
 
-    In a minimum where the winner lowers the objective by more than 1 %, and more than ten times as
+    It is trapped if the winner lowers the objective by more than 1 %, and more than ten times as
     far as the loser.
     """
     own, others, adam = (
@@ -362,7 +363,7 @@ def _trapped(rows: Sequence[Rows], loser: str, winner: str, config: Config) -> C
 
 
 def _how_often(shares: dict[str, Any]) -> Claim:
-    """On what share of all chairs CMA-ES is better."""
+    """Share of all chairs on which CMA-ES is better."""
     texts = [
         f"{k} frames: better than descent on {found['gradient descent']['share']:.0%}"
         f" ({found['gradient descent']['mean']:+.3f}), than Adam on {found['Adam']['share']:.0%}"

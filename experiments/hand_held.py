@@ -2,7 +2,7 @@ r"""Seats in a room, filmed by hand from close up: is the whole seat found, and 
 
     python experiments/hand_held.py --meshes cad_chairs/
 
-Each seat stands on a floor, before a wall, with a table beside it. The camera begins so close that
+Each seat stands on a floor, before a wall, with a table next to it. The camera begins so close that
 the legs are out of view, moves back and then around, a little shaken, with a Kinect's noise; its
 poses are given, and one click shows the seat in the first frame. A seat is whole where all four
 sides of its box lie within 4 cm of the truth; a result is wrong where they, or its height, do not,
@@ -60,11 +60,11 @@ class Config:
     meshes: Path = Path("cad_chairs")
     """Folder or archive of seats, +y up and +z in front."""
     seats: int = 24
-    """How many of them, spread over all."""
+    """Number of seats, spread over all."""
     frames: int = 12
     results: Path = RESULTS
     smoke: bool = False
-    """One seat, few frames: does it run?"""
+    """A test run with one seat and few frames."""
 
 
 def main(config: Config) -> None:
@@ -109,7 +109,7 @@ def _chosen(config: Config) -> Iterator[meshes.MeshSource]:
 
 
 def summary(seats: dict[str, Any]) -> dict[str, int]:
-    """How many seats are whole, and how many results are wrong, with and without a word of it."""
+    """Numbers of whole seats, and of wrong results with and without a warning."""
     wrong = [one for one in seats.values() if np.abs(one["sides"]).max() > NEAR]
     return {
         "seats": len(seats),

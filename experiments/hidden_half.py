@@ -3,13 +3,13 @@ r"""What fills the hidden half of a chair best: four networks, small, at equal b
     jaxshape dataset --output data/chairs --count 4096
     python experiments/hidden_half.py --dataset data/chairs --meshes cad_chairs/
 
-Each network is trained from scratch on the same pairs, the same number of them:
+Each network is trained from scratch on the same number of the same pairs:
 
-- conditional VAE: a U-Net of F and M whose decoder takes a code too, so that the code carries what
-  is hidden (the package's default, at its full size);
+- conditional VAE: a U-Net of F and M whose decoder takes a code too, so that the code describes the
+  hidden part (the package's default, at its full size);
 - U-Net: the same network without a code;
 - auto-encoder, F: the paper's network, which sees F alone, through a code of 100 numbers;
-- auto-encoder, F and M: its encoder sees what is occluded too;
+- auto-encoder, F and M: its encoder sees the occlusion mask, too;
 - auto-encoder + U-Net: nothing new is trained. The U-Net's probabilities take the place of
   G(lambda_0) in Eq. 7 and fill the composed shape, and the code of the auto-encoder of F and M is
   searched.
@@ -82,7 +82,7 @@ class Config:
     meshes: Path | None = None
     """Folder of meshes to judge on; procedural chairs kept for tests where it is not given."""
     chairs: int = 78
-    """How many of them."""
+    """Number of meshes or chairs."""
     output: Path = Path("out/hidden_half")
     """Folder of the training runs."""
     steps: int = 400
@@ -93,7 +93,7 @@ class Config:
     """Train in bfloat16, where the processor has matrix units for it."""
     results: Path = RESULTS
     smoke: bool = False
-    """Tiny networks, one step, two chairs: does it run?"""
+    """Tiny networks, one step, two chairs, as a test."""
 
 
 class Scores(NamedTuple):
@@ -108,7 +108,7 @@ class Scores(NamedTuple):
 
 
 def trained(config: Config) -> tuple[dict[str, ShapePrior], dict[str, Any]]:
-    """Every network after the same number of pairs, and what its training took."""
+    """Every network after the same number of pairs, with its training cost."""
     dataset = open_dataset(config.dataset)
     priors, records = {}, {}
     for name, settings in NETWORKS.items():
@@ -139,7 +139,7 @@ def record_of(folder: Path, settings: TrainConfig, prior: ShapePrior) -> dict[st
 
 
 def scores_of(grids: Grids, logits, case: Case, conditional: bool, fill_logits=None) -> Scores:
-    """Of a decoded shape, filled by itself unless other logits are given."""
+    """Scores of a decoded shape, which fills itself unless other logits are given."""
     filled = complete(
         grids,
         logits if fill_logits is None else fill_logits,
@@ -175,7 +175,7 @@ def contest(
 
 
 def cases(config: Config, camera: str) -> Iterator[tuple[str, Case]]:
-    """Each chair after each number of frames; those of which nothing was measured are left out."""
+    """Each chair after each number of frames; chairs of which nothing was measured are left out."""
     name, noise = CAMERAS[camera]
     seen = EvaluateConfig(frames=FRAMES, camera=name, noise=noise)
     chairs = listed(config.meshes, config.chairs)[: config.chairs]

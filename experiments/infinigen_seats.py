@@ -8,9 +8,8 @@
     .venv-infinigen/bin/python experiments/infinigen_seats.py --output data/infinigen
 
 makes 128 seats as PLY files, +y up and front along +z, in metres: 1 to 11 s each on one core. The
-generators are those of Infinigen Indoors (Raistrick et al. 2024, BSD licence), +x front and +z up.
-This script needs nothing of jaxshape, and jaxshape nothing of it. The shipped weights are scored
-by
+generators come from Infinigen Indoors (Raistrick et al. 2024, BSD licence), +x front and +z up.
+This script needs nothing of jaxshape, and jaxshape nothing of it. The shipped weights are scored by
 
     jaxshape evaluate --meshes data/infinigen --output infinigen.json
 """
@@ -39,7 +38,7 @@ GENERATORS = {
 
 
 def make_seat(kind: str, seed: int) -> trimesh.Trimesh:
-    """One seat in the frame of jaxshape: Infinigen's (y, z, x)."""
+    """A seat in the frame of jaxshape: Infinigen's (y, z, x)."""
     bpy.ops.object.select_all(action="SELECT")
     bpy.ops.object.delete()
     made = GENERATORS[kind](seed).spawn_asset(0)

@@ -4,11 +4,11 @@ r"""IoU by number of frames: encoder, gradients, CMA-ES, and F alone (paper, Fig
 
 288 procedural chairs and the 78 CAD seats, each seen by the first k frames of an orbit at 30
 degrees elevation, 20 degrees apart, with true poses and no noise, as in section 4.1 of the paper.
-Every search starts from the encoder's code and has the same number of iterations, with the values
-that step_size.py finds best. The two bounds are F with all occluded voxels set to empty and to
-full. Means over chairs with their 95 % intervals by bootstrap.
+Every search starts from the encoder's code and has the same number of iterations, with the best
+values of step_size.py. The two bounds are F with all occluded voxels set to empty and to full.
+Means over chairs with their 95 % intervals by bootstrap.
 
-Results: experiments/results/iou_by_frames.json, .png and .svg; chairs that are done are kept.
+Results: experiments/results/iou_by_frames.json, .png and .svg; finished chairs are kept.
 Time: 50 minutes on two cores.
 """
 
@@ -47,12 +47,12 @@ class Config:
     frames: tuple[int, ...] = (1, 4, 8, 18)
     """Numbers of frames that are fused."""
     iterations: int = 60
-    """Of every search (paper: 350)."""
+    """Iterations of every search (paper: 350)."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
@@ -64,7 +64,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Score every method on every chair, and write what was found."""
+    """Score every method on every chair, and write the results."""
     prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
@@ -79,7 +79,7 @@ def run(config: Config) -> Journal:
 
 
 def claims(journal: Journal, config: Config) -> list[Claim]:
-    """What the paper says of this figure, and what is found here."""
+    """The paper's claims about this figure, and our findings."""
     few, many = config.frames[0], config.frames[-1]
 
     def gain(group: str, better: str, worse: str, k: int) -> np.ndarray:

@@ -54,7 +54,7 @@ RESULTS = Path(__file__).parent / "results"
 SEATS_AT_A_TIME = 4
 LEAST = {"F": (0.47, 0.55, 0.65, 0.70), "oracle": (0.88, 0.86, 0.85, 0.86),
          "refined composed": (0.55, 0.64, 0.70, 0.73)}  # fmt: skip
-"""What distances are to reach after 1, 4, 8 and 18 noisy frames."""
+"""Targets of signed distances after 1, 4, 8 and 18 noisy frames."""
 
 
 @dataclass(frozen=True)
@@ -64,24 +64,24 @@ class Config:
     meshes: Path | None = None
     """Folder of the CAD seats; procedural chairs kept for tests where it is not given."""
     chairs: int = 78
-    """How many of them."""
+    """Number of meshes or chairs."""
     camera: CameraName = "kinect"
     noise: bool = True
     frames: tuple[int, ...] = (1, 4, 8, 18)
     """Numbers of frames that are fused."""
     iterations: int = 60
-    """Of the search."""
+    """Iterations of the search."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     name: str = "measurement"
-    """Of the results file."""
+    """Name of the results file."""
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 class Seen(NamedTuple):
-    """One chair after each number of frames."""
+    """A chair after each number of frames."""
 
     points: tuple[np.ndarray, np.ndarray]
     """F and M."""
@@ -98,7 +98,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Measure and rebuild every chair both ways, and write what was found."""
+    """Measure and rebuild every chair both ways, and write the results."""
     prior = load_prior(config.weights)
     settings = {
         "set": "procedural" if config.meshes is None else "CAD",
@@ -216,7 +216,7 @@ def rounded(values: np.ndarray) -> list[float]:
     return [round(float(x), 4) for x in values]
 
 
-# ------------------------------------------------------------------ what is found
+# ------------------------------------------------------------------ evaluation
 
 
 def means(journal: Journal) -> dict[str, dict[str, list[float]]]:

@@ -40,7 +40,8 @@ from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
 from study import SEARCH, SEEN
 
 AZIMUTH = -65.0
-"""Of the pictures, in degrees: the handle in profile, from the side that four frames do not see."""
+"""View of the pictures, in degrees: the handle in profile, from the side that four frames do not
+see."""
 
 Profile = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
 """Radius at a height, both in metres."""
@@ -48,20 +49,20 @@ Profile = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
 
 @dataclass(frozen=True)
 class Config:
-    """How many mugs, where they go, and what is drawn of them."""
+    """Number of mugs, output folder, and pictures."""
 
     output: Path = Path("data/mugs")
     """Folder of the meshes."""
     mugs: int = 300
     """Meshes to write."""
     seed: int = 0
-    """Of their shapes."""
+    """Seed of the shapes."""
     weights: Path | None = None
     """Draw mugs held out of the training of these weights."""
     picture: Path = Path("docs/mugs.png")
     """The picture, when there are weights."""
     iterations: int = 100
-    """Of the search behind the picture."""
+    """Iterations of the search for the picture."""
     smoke: bool = False
     """Only a dozen mugs, and two iterations."""
 
@@ -158,7 +159,7 @@ def run(config: Config) -> list[str]:
 
 
 def draw(mesh: trimesh.Trimesh, case: Any, found: Any) -> list[Panel]:
-    """One mug as it is, as four frames measure it (`Case`), and rebuilt (`Reconstruction`)."""
+    """A mug: the mesh, its measurement in four frames (`Case`), and its `Reconstruction`."""
     occupied, occluded, _ = case.grids
     composed = np.where(occluded, 2 * found.composed, occupied.astype(int))
 

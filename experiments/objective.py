@@ -1,4 +1,4 @@
-r"""The residual as the variable: what should be minimised over the code? (beyond the paper, Eq. 7)
+r"""Comparison of residuals as objectives of a search (beyond the paper, Eq. 7)
 
     python experiments/objective.py --test.meshes cad_chairs/
 
@@ -10,9 +10,9 @@ themselves (paper) or whitened ones as coordinates. Unless named otherwise, the 
 as printed, the codes whitened. Weighing measured occupied voxels and the prior three times is the
 same as counting free space a third, which is the `balanced` objective. For each, the IoU of the
 decoded and of the composed shape. Where the search is cut into quarters, Adam starts afresh with
-each. Some of them again from depth images with the faults of a real sensor.
+each. Some variants are repeated with depth images that have the faults of a real sensor.
 
-Results: experiments/results/objective.json, .png and .svg; chairs that are done are kept.
+Results: experiments/results/objective.json, .png and .svg; finished chairs are kept.
 Time: 16 minutes on two cores.
 """
 
@@ -58,13 +58,13 @@ RESULTS = Path(__file__).parent / "results"
 
 @dataclass(frozen=True)
 class Residual:
-    """What is minimised."""
+    """The objective of a search."""
 
     occupied_weight: float = 3.0
     prior_scales: tuple[float, ...] = (1.0,)
     """Factors of alpha, one for each part of the search."""
     alpha_is_printed: bool = True
-    """Else 1, whatever was seen."""
+    """Otherwise alpha is 1 for every measurement."""
     anchor_moves: bool = False
     """The prior is the shape found so far, renewed with every part."""
     search: RefineConfig = RefineConfig()
@@ -105,12 +105,12 @@ class Config:
     frames: tuple[int, ...] = (1, 4, 8)
     """Numbers of frames that are fused."""
     iterations: int = 48
-    """Of Adam."""
+    """Steps of Adam."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
@@ -124,7 +124,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config, residuals: dict[str, Residual] = RESIDUALS) -> tuple[Journal, Journal]:
-    """Minimise every residual for every chair, without and with noise; write what was found."""
+    """Minimise every residual for every chair, without and with noise; write the results."""
     prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
@@ -158,7 +158,7 @@ def by_residual(residual: Residual, prior: ShapePrior, iterations: int) -> Conte
         anchor = logits = decode(prior, code)
         for scale in residual.prior_scales:
             alpha = scale if residual.alpha_is_printed else scale / printed_alpha(grids.occluded)
-            # Against what was measured as occupied; Adam does not care for a common factor.
+            # Weights relative to measured surface; a common factor does not change Adam.
             weights = Weights(1 / residual.occupied_weight, alpha / residual.occupied_weight)
             targets = weigh(grids, anchor, weights)
             found = refine(
@@ -181,7 +181,7 @@ def printed_alpha(occluded: Bool[Array, "case x y z"]) -> Float[Array, "case 1 1
 
 
 def gain(journal: Journal, frames: int, name: str, score: str = "iou") -> np.ndarray:
-    """What a residual gains over the encoder, for every chair."""
+    """Gain of a residual over the encoder, for every chair."""
     chairs = [column(journal, group, frames, name, score) for group in groups(journal)]
     before = [column(journal, group, frames, "encoder", score) for group in groups(journal)]
     return np.concatenate(chairs) - np.concatenate(before)

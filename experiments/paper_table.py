@@ -3,8 +3,8 @@ r"""The table of the paper's claims in docs/paper.md, written from the results f
     python experiments/paper_table.py
 
 Every script of `SCRIPTS` leaves its claims, with the figures found here, in its results file. This
-one puts them into docs/paper.md, between the two comments that name it. `--check` only tells
-whether the page says what the files say.
+one puts them into docs/paper.md, between the two comments that name it. `--check` only compares the
+page with the files.
 """
 
 import json
@@ -39,7 +39,7 @@ class Config:
     results: Path = ROOT / "experiments" / "results"
     page: Path = ROOT / "docs" / "paper.md"
     check: bool = False
-    """Change nothing; exit with 1 where the page says something else than the files."""
+    """Change nothing; exit with 1 if the page differs from the files."""
 
 
 def main(config: Config) -> None:
@@ -55,7 +55,7 @@ def main(config: Config) -> None:
 
 
 def table(results: Path) -> str:
-    """A row for each claim: what the paper says, what was found, by which command, in what time."""
+    """A row for each claim: the paper's claim, our finding, the command and its time."""
     lines = [
         "| figure | claim (`beyond`: ours) | holds? | found here | script, time |",
         "|---|---|---|---|---|",

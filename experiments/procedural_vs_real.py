@@ -5,7 +5,7 @@
 Compares 5,000 procedural chairs with two sets of real seats: CAD models (a folder of meshes, +y up,
 front along +z) and, if given, chairs put together from oriented boxes. All are turned into the same
 canonical grids of surface voxels, each axis filling the grid, and every statistic is one geometric
-estimator applied alike to all of them, so that what it gets wrong it gets wrong everywhere.
+estimator applied to all of them, so that its errors are the same everywhere.
 
 The file of box chairs holds `boxes` [n, 12] (centre, edge lengths, first axis, second axis) and
 `count` (boxes of each chair, in order), +y up, back at -z. They are boxes only, so they tell sizes,
@@ -15,7 +15,7 @@ Expected, as mean IoU with the nearest: CAD seats 0.41 with procedural chairs an
 chairs; box chairs 0.43 with procedural ones and 0.60 with others of their own, among which many are
 nearly the same; procedural chairs 0.49 with others of their own. About four minutes on one core;
 grids are kept in `--cache`, so that a second run takes one or two. Empty that folder after a change
-to what is measured of points.
+to the statistics of points.
 """
 
 import hashlib
@@ -49,7 +49,7 @@ RESULTS = Path(__file__).parent / "results"
 
 @dataclass(frozen=True)
 class Config:
-    """What is compared, and where the results go."""
+    """Sources to compare, and output."""
 
     cad: Path
     """Folder of CAD seats, +y up, front along +z."""
@@ -60,7 +60,7 @@ class Config:
     cache: Path = Path("out/procedural_vs_real")
     """Folder that keeps the grids of each source."""
     output: Path = RESULTS / "procedural_vs_real.json"
-    """The results; the figure lies beside them, as .png."""
+    """The results; the figure has the same name, as .png."""
     write_boxes: Path | None = None
     """Only write the first --chairs of --boxes here, as meshes to train on for comparison."""
     smoke: bool = False
@@ -92,7 +92,7 @@ def box_chairs(path: Path, count: int | None) -> Iterator[tuple[str, trimesh.Tri
 
 
 def box_mesh(boxes: Float[np.ndarray, "n 12"]) -> trimesh.Trimesh:
-    """One mesh of oriented boxes, each given by centre, edge lengths, first and second axis."""
+    """A mesh of oriented boxes, each given by centre, edge lengths, first and second axis."""
     center, size, first, second = np.split(boxes, 4, axis=1)
     axes = np.stack([first, second, np.cross(first, second)], axis=1)
     cube = trimesh.creation.box()
@@ -101,11 +101,11 @@ def box_mesh(boxes: Float[np.ndarray, "n 12"]) -> trimesh.Trimesh:
     return trimesh.Trimesh(corners.reshape(-1, 3), faces.reshape(-1, 3), process=False)
 
 
-# ------------------------------------------------------------------ what is measured of a mesh
+# ------------------------------------------------------------------ statistics of a mesh
 
 
 class Seats(NamedTuple):
-    """One source of seats, ready to be compared."""
+    """A source of seats, ready to be compared."""
 
     names: list[str]
     surface: Bool[np.ndarray, "seat x y z"]
@@ -121,7 +121,7 @@ runners, below most stretchers."""
 
 
 def measure(source: Iterator[tuple[str, trimesh.Trimesh]], total: int | None, what: str) -> Seats:
-    """Grids of all the meshes, and what grids are too coarse for."""
+    """Grids of all the meshes, and statistics that need finer detail than grids."""
     names, rows = [], []
     for seed, (name, mesh) in enumerate(track(source, what, total)):
         frame = grid.fit_box(*jnp.float32(mesh.bounds))
@@ -178,7 +178,7 @@ def back_thickness(
 
 
 def cached(path: Path, source: Iterator[tuple[str, trimesh.Trimesh]], total: int | None) -> Seats:
-    """`measure`, or what it found before."""
+    """`measure`, or its earlier result."""
     if not path.exists():
         seats = measure(source, total, path.stem.split("-")[0])
         packed = seats._replace(surface=np.packbits(seats.surface.reshape(len(seats.names), -1), 1))
@@ -200,7 +200,7 @@ def fingerprint(*paths: Path) -> str:
     return digest.hexdigest()[:12]
 
 
-# ------------------------------------------------------------------ what is measured of a grid
+# ------------------------------------------------------------------ statistics of a grid
 
 
 Y, Z = np.arange(RESOLUTION)[None, :, None], np.arange(RESOLUTION)[None, None, :]
@@ -242,7 +242,7 @@ def grid_statistics(seats: Seats) -> dict[str, Float[np.ndarray, " n"]]:
 
 
 def _filled_rows(outline: Bool[np.ndarray, "n x y"]) -> Float[np.ndarray, " n"]:
-    """How much of an outline is filled between the first and the last voxel of each row."""
+    """Filled share of an outline between the first and the last voxel of each row."""
     between = _until(outline, 1) & _until(outline[:, ::-1], 1)[:, ::-1]
     return outline.sum((1, 2)) / np.maximum(between.sum((1, 2)), 1)
 
@@ -278,7 +278,7 @@ def arms_of(
 
 
 def parts(seats: Seats) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Which seats have which part."""
+    """The parts that each seat has."""
     surface, seat = seats.surface, seat_layer(seats.surface)
     pieces = np.array([components(one)[1] for one in surface])
     return {
@@ -309,7 +309,7 @@ def nearest(
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """The highest IoU of each grid with any of the others, and with which.
 
-    With `same`, these are the first of those, and none is compared with itself.
+    With `same`, the first seats are part of the second ones, and none is compared with itself.
     """
     ever = those.any(axis=0)
     B = those[:, ever].astype(np.float32)
@@ -337,7 +337,7 @@ def spread(values: Float[np.ndarray, " n"]) -> dict[str, float]:
 
 
 def compare(ours: Float[np.ndarray, " n"], real: Float[np.ndarray, " m"]) -> dict[str, float]:
-    """How well one distribution covers another.
+    """Coverage of one distribution by another.
 
     `covered`: share of the real values within our 1 to 99 %. `KS`: largest gap of the cumulative
     distributions. `Wasserstein`: mean distance between them, in standard deviations of the real.
@@ -466,13 +466,14 @@ def plot(
 
 
 def _plot_projections(figure: Any, sources: dict[str, Seats]) -> None:
-    """How often a voxel is occupied, as the mean along each axis."""
+    """Frequency of occupied voxels, as the mean along each axis."""
     views = {"from the front": 0, "from the right": 1, "from above": 2}
     axes = figure.subplots(len(sources), 3, squeeze=False)
     image = None
     for row, (name, seats) in zip(axes, sources.items(), strict=True):
         mean = seats.surface.mean(axis=0)
-        # As a viewer sees them: the front of the seat to the left, and at the foot of the picture.
+        # Oriented for the viewer: the front of the seat is at the left, or at the bottom of the
+        # picture.
         pictures = mean.mean(2).T[::-1], mean.mean(0)[::-1, ::-1], mean.mean(1).T
         for ax, (view, i) in zip(row, views.items(), strict=True):
             image = ax.imshow(pictures[i], vmin=0, vmax=0.3, cmap="viridis")

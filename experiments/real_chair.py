@@ -4,10 +4,11 @@ r"""A real chair, keyframe by keyframe: measured, proposed, refined (paper, Fig.
         --box experiments/kitchen_chair_box.json
 
 The recording of real_recording.py: the red kitchen of 7-Scenes, sequence 01, frames 0 to 265, every
-fifth; a slatted chair half hidden by a table. After each keyframe CMA-ES goes on for 40 iterations,
-at the end for 100, once with the poses that were given and once with the first of them alone, the
-others tracked. Without a true shape, what is told is how shapes agree with the measurement: which
-share of F's voxels they explain, and which share of the voxels seen to be free they fill.
+fifth; a slatted chair half hidden by a table. CMA-ES continues for 40 iterations after each
+keyframe, and for 100 at the end. This is done twice: with the given poses, and with the first pose
+alone and all others tracked. The true shape is unknown. The figures are the agreement with the
+measurement: the share of F's voxels that a shape explains, and the share of free voxels that it
+fills.
 
 Results: experiments/results/real_chair.json, .png and .svg, which hold no pixel of the recording.
 The figure with images goes to out/real_chair/: the recording is for research alone, and is not to
@@ -61,14 +62,14 @@ class Config:
     box: Path = Path("experiments/kitchen_chair_box.json")
     """The object's box in the world of these poses."""
     iterations: int = 100
-    """Of CMA-ES at the end."""
+    """Iterations of CMA-ES at the end."""
     keyframe_iterations: int = 40
-    """Of CMA-ES after each keyframe."""
+    """Iterations of CMA-ES after each keyframe."""
     results: Path = RESULTS
     images: Path = Path("out/real_chair")
     """Folder for the figure that shows images of the recording."""
     smoke: bool = False
-    """Few frames and iterations: does it run?"""
+    """Few frames and iterations, as a test."""
 
 
 class Moment(NamedTuple):
@@ -85,13 +86,13 @@ class Moment(NamedTuple):
 
 
 class Rebuilt(NamedTuple):
-    """All moments of one way, and what came out at its end."""
+    """All moments of one way to rebuild, and its final results."""
 
     moments: list[Moment]
     mesh: trimesh.Trimesh
     """The composed shape, in the object frame."""
     T_object_camera: np.ndarray
-    """Of all keyframes."""
+    """Poses of all keyframes."""
 
 
 def main(config: Config) -> None:
@@ -107,7 +108,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config, recording: Recording) -> tuple[Journal, dict[str, Rebuilt]]:
-    """Rebuild the chair each way, and write what was found.
+    """Rebuild the chair each way, and write the results.
 
     Nothing is rebuilt where the results of these settings are there, with all pictures.
     """
@@ -190,11 +191,11 @@ def _finished(moments: Sequence[tuple[Moment, MapState]], box: Box) -> Rebuilt:
     )
 
 
-# ------------------------------------------------------------------ what is found
+# ------------------------------------------------------------------ evaluation
 
 
 def agreement(one: Moment) -> dict[str, Any]:
-    """How the encoder's and the refined shape agree with what was measured."""
+    """Agreement of the encoder's and the refined shape with the measurement."""
     free = ~one.occupied & ~one.occluded
     shapes = {
         "encoder": np.asarray(one.shape.completed_first[0]),
@@ -218,7 +219,7 @@ def agreement(one: Moment) -> dict[str, Any]:
 
 
 def claims(journal: Journal) -> list[Claim]:
-    """What the paper says of this figure, as far as it can be told without a true shape."""
+    """The paper's claims about this figure, as far as they can be tested without a true shape."""
 
     def last(way: str) -> dict[str, Any]:
         return list(journal.rows[way].values())[-1]
@@ -256,7 +257,7 @@ TITLES = {"F and M": BLUE, "encoder": PINK, "refined": ORANGE}
 
 
 def plot(rebuilt: dict[str, Rebuilt], stem: Path, recording: Recording | None = None) -> None:
-    """Rows of keyframes with the given poses, and the surfaces with all cameras beside them.
+    """Rows of keyframes with the given poses, and next to them the surfaces with all cameras.
 
     Images are shown only where a recording is given.
     """
@@ -324,7 +325,7 @@ def _pictures(
 
 
 def _images(one: Moment, recording: Recording) -> dict[str, np.ndarray]:
-    """The colour image, and what of it was taken for the object; none without colour."""
+    """The colour image and the segmented object; None without colour."""
     color = recording[one.frame].color
     if color is None:
         return {}
@@ -342,7 +343,8 @@ def draw_surface(
     T_object_camera: np.ndarray,
     view: tuple[float, float],
 ) -> None:
-    """The mesh and the pyramids of cameras, orthographically, from beside the first camera."""
+    """The mesh and the pyramids of cameras, orthographically, from a point next to the first
+    camera."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     a, e = np.radians(view) + np.radians((60, 10))
@@ -369,7 +371,7 @@ def draw_surface(
 
 
 def _pyramid(T_object_camera: np.ndarray, length: float = 0.16) -> np.ndarray:
-    """Edges of what a camera sees, from its centre, in the object frame."""
+    """Edges of a camera's viewing pyramid, in the object frame."""
     corners = np.array([[-0.55, -0.42, 1], [0.55, -0.42, 1], [0.55, 0.42, 1], [-0.55, 0.42, 1]])
     rim = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
     edges = np.stack([np.zeros_like(corners), corners], axis=1)

@@ -1,17 +1,18 @@
-r"""One real recording three ways: with its given poses, with the first of them, with a click alone.
+r"""A real recording rebuilt three ways: with all given poses, with the first pose, with only a
+click.
 
     python experiments/real_recording.py --recording kitchen/frames \
         --box experiments/kitchen_chair_box.json --click 240 150
 
 The chair of the paper's figure on real data (real_cma_au), on a recording that anyone can get: the
 red kitchen of 7-Scenes, sequence 01, frames 0 to 265, every fifth: a slatted chair half hidden by a
-table. `given` takes the poses and the box, `first` the first pose and the box and tracks the rest,
-`click` gets one pixel of the first frame and nothing else: no pose, no box, no floor, no scale.
+table. `given` takes the poses and the box. `first` takes the first pose and the box, and tracks the
+other frames. `click` gets only one pixel of the first frame: no pose, no box, no floor, no scale.
 
 Compared with the given poses: distance and angle between cameras, as root mean square and maximum,
 and how well depth images agree with each other under the given and under our poses (root mean
 square distance of a keyframe's points to the planes of the one before, after the same matching).
-The given poses are not exact either: that is what the last figure is for.
+The last figure shows that the given poses are not exact either.
 
 Results: experiments/results/real_recording.json and .png (the meshes from three sides, no image of
 the recording). Time: 5 minutes on two busy cores.
@@ -65,10 +66,10 @@ class Config:
     click: tuple[float, float] = (240, 150)
     """A pixel of the object in the first frame."""
     iterations: int = 100
-    """Of CMA-ES at the end; after each keyframe, `MappingConfig.keyframe_iterations`."""
+    """Iterations of CMA-ES at the end; after each keyframe, `MappingConfig.keyframe_iterations`."""
     results: Path = RESULTS
     smoke: bool = False
-    """Few frames and iterations, in seconds: does it run?"""
+    """Few frames and iterations, in seconds, as a test."""
 
 
 def main(config: Config) -> None:
@@ -163,7 +164,7 @@ def _against_given(
 
 
 def _against_box(found: Box, given: Box) -> dict[str, Any]:
-    """How far the box that was found lies from the one made by hand."""
+    """Differences between the box found and the box made by hand."""
     between = np.linalg.inv(given.T_world_object) @ found.T_world_object
     return {
         "box_center_cm": np.round(100 * between[:3, 3], 1).tolist(),
@@ -173,7 +174,8 @@ def _against_box(found: Box, given: Box) -> dict[str, Any]:
 
 
 def _depth_agreement(progress: Progress, sequence: Sequence) -> dict[str, float]:
-    """How far keyframes lie from the surface of the one before: under our poses, and the given."""
+    """Distance of each keyframe from the surface of the previous one: with our poses, and with the
+    given."""
     keyframes = [log.index for log in progress.logs if log.status == "keyframe"]
     poses = trajectory(progress)
     ours, given = [], []

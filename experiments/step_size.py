@@ -4,12 +4,12 @@ r"""Steps of gradient descent and of Adam, and sigma0 of CMA-ES (paper, Fig. gm 
 
 8 procedural chairs and 4 CAD seats, each seen in 1, 4 and 8 frames. Every search starts from the
 encoder's code and has 60 iterations, in the codes themselves as in the paper (where 0.14 is its
-step and 2 its sigma0) or in whitened codes. The paper does not say what it averages; here a value
-is as good as the objective falls with it, as a part of what the best value of its method attains,
-and the default of each method is held against the best.
+step and 2 its sigma0) or in whitened codes. The paper does not say what it averages. Here a value
+is rated by the decrease of the objective, as a share of the decrease with the best value of its
+method, and the default of each method is compared with the best.
 
 Results: experiments/results/step_size.json, .png and .svg, and the searches along their way in
-step_size_curves.png and .svg; chairs that are done are kept. Time: 10 minutes on two cores.
+step_size_curves.png and .svg; finished chairs are kept. Time: 10 minutes on two cores.
 """
 
 import itertools
@@ -93,12 +93,12 @@ class Config:
     frames: tuple[int, ...] = (1, 4, 8)
     """Numbers of frames that are fused."""
     iterations: int = 60
-    """Of every search."""
+    """Iterations of every search."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
@@ -111,7 +111,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Try every value on every chair, and write what was found."""
+    """Try every value on every chair, and write the results."""
     prior = load_prior(config.weights)
     settings = {
         "frames": config.frames,
@@ -175,13 +175,13 @@ def sampled(iterations: int) -> list[int]:
 
 
 def scores(journal: Journal, frames: int, method: str, score: str) -> np.ndarray:
-    """One score of all values of a method on all chairs: [chair trial ...]."""
+    """A score of all values of a method on all chairs: [chair trial ...]."""
     rows = journal.rows.values()
     return np.array([row[str(frames)][method][score] for row in rows])
 
 
 def fall(journal: Journal, frames: int, method: str) -> np.ndarray:
-    """Mean fall of the objective with each value, as a part of the largest."""
+    """Mean decrease of the objective with each value, as a share of the largest."""
     fallen = (
         scores(journal, frames, method, "start") - scores(journal, frames, method, "objective")
     ).mean(axis=0)
@@ -194,7 +194,7 @@ def gain(journal: Journal, frames: int, method: str) -> np.ndarray:
 
 
 def overshoots(journal: Journal, frames: int, method: str) -> np.ndarray:
-    """On what part of the chairs the last loss is above the first, with each value."""
+    """Share of the chairs whose last loss is above the first, with each value."""
     last, start = (scores(journal, frames, method, score) for score in ("last", "start"))
     return (last > start).mean(axis=0)
 
@@ -215,7 +215,7 @@ def best_in(journal: Journal, config: Config, method: str, space: str) -> Trial:
 
 
 def summary(journal: Journal, config: Config) -> dict[str, Any]:
-    """The best values, and for each value and number of frames what it attains."""
+    """The best values, and the figures of each value and number of frames."""
 
     def of(method: str, k: int) -> dict[str, Any]:
         means = {
@@ -243,7 +243,7 @@ def text(trial: Trial) -> str:
 
 
 def parts(journal: Journal, config: Config, method: str, trial: Trial) -> list[float]:
-    """What part of the best fall a value attains, for each number of frames."""
+    """Share of the best decrease that a value attains, for each number of frames."""
     i = TRIALS[method].index(trial)
     return [float(fall(journal, k, method)[i]) for k in config.frames]
 
@@ -253,7 +253,7 @@ def percents(journal: Journal, config: Config, method: str, trial: Trial) -> str
 
 
 def claims(journal: Journal, config: Config) -> list[Claim]:
-    """What the paper says of this figure, what is found here, and what follows."""
+    """The paper's claims about this figure, our findings, and their consequences."""
     return [
         papers_step(journal, config),
         papers_sigma(journal, config),

@@ -1,6 +1,6 @@
-"""Searches compared on the same chairs: what the scripts in `experiments/` have in common. [host]
+"""Comparison of searches on the same chairs: common code of the scripts in `experiments/`. [host]
 
-A `Contestant` is given a batch of cases, what was seen of chairs after some number of frames, and
+A `Contestant` takes a batch of cases, measurements of chairs after some number of frames, and
 returns its scores as arrays with a row for each case; `compare` runs some on the whole `TestSet`.
 """
 
@@ -35,16 +35,16 @@ CASES_AT_A_TIME = 64
 """Cases searched together, unless a chair has more: the rows between two entries of the journal."""
 
 SEEN = EvaluateConfig(camera="paper", noise=False, fusion="points")
-"""How chairs are seen in the paper: square images without noise, their points counted in voxels."""
+"""Camera and fusion of the paper: square images without noise, their points counted in voxels."""
 SEARCH = RefineConfig(symmetry=False)
-"""How shapes are composed in the paper: nothing is mirrored."""
+"""Search and composition of the paper: nothing is mirrored."""
 
 TUNED: dict[str, tuple[str, RefineConfig]] = {
     "gradient descent": ("gradient", replace(SEARCH, space="raw", step_size=40.0)),
     "Adam": ("gradient:adam", SEARCH),
     "CMA-ES": ("cma", replace(SEARCH, space="raw", sigma0=0.14)),
 }
-"""The paper's searches and Adam, with the values that experiments/step_size.py finds best."""
+"""The paper's searches and Adam, with the best values of experiments/step_size.py."""
 
 # Scores of a batch of cases, from a random key for each, the prior, and the cases themselves.
 Scores = Mapping[str, Array]
@@ -53,7 +53,7 @@ Contestant = Callable[[Key[Array, " case"], ShapePrior, Case], Scores]
 
 @dataclass(frozen=True)
 class TestSet:
-    """The chairs that searches are compared on; none was trained on."""
+    """The chairs for the comparison of searches; no network was trained on them."""
 
     __test__ = False  # pytest would take the name for a test
 
@@ -66,7 +66,7 @@ class TestSet:
 
 
 class Subject(NamedTuple):
-    """One chair of the test set."""
+    """A chair of the test set."""
 
     name: str
     group: str
@@ -128,7 +128,7 @@ def shape_and_objective(found: Reconstruction, case: Case) -> Scores:
 
 
 def measurement(keys: Key[Array, " case"], prior: ShapePrior, case: Case) -> Scores:
-    """The paper's lower and upper bound: F with what is occluded set to empty, and to full."""
+    """The paper's lower and upper bound: F with occluded voxels set to empty, and to full."""
     return bounds(case.grids.occupied, case.grids.occluded, case.surface)._asdict()
 
 
@@ -144,8 +144,8 @@ def compare(
 ) -> None:
     """Run every contestant on every chair, after each number of frames, unless its row is there.
 
-    A row is `{"group": ..., frames: {contestant: scores}}`; `seconds` are added to the scores:
-    those of the batch, compiling apart, shared out over its cases. All contestants draw the same
+    A row is `{"group": ..., frames: {contestant: scores}}`; `seconds` are added to the scores: the
+    time of the batch without compilation, divided by its cases. All contestants draw the same
     random keys, which depend on the chair and the number of frames alone. `noise` adds the faults
     of a real depth sensor. Fewer cases `at_a_time` lose less of a long search when it is killed.
     """
@@ -187,7 +187,7 @@ def _left(names: Iterable[str], chairs: Sequence[Subject], journal: Journal) -> 
 
 
 def observed(chairs: Sequence[Subject], config: EvaluateConfig) -> Iterator[tuple[Subject, Case]]:
-    """The chairs and what is seen of them; those that cannot be used are named and left out."""
+    """The chairs and their measurements; unusable chairs are named and left out."""
     for chair in chairs:
         model = load_object(chair.item)
         case = None if isinstance(model, Skipped) else observe(model, config)
@@ -217,7 +217,7 @@ def _timed(run: Callable[..., Scores], *args: Any) -> dict[str, np.ndarray]:
 def _row(
     chair: Subject, found: Mapping[str, Any], frames: Sequence[int], place: int, journal: Journal
 ) -> dict[str, Any]:
-    """The row of one chair, which has this place in the batch, with what it had before."""
+    """The row of a chair at this place in the batch, merged with its earlier row."""
     row = journal.rows.get(chair.name, {"group": chair.group})
     for i, k in enumerate(frames, start=place * len(frames)):
         row[str(k)] = row.get(str(k), {}) | {
@@ -235,19 +235,19 @@ def _rounded(value: Any) -> Any:
 
 
 class Claim(NamedTuple):
-    """What the paper says, and what was found here: a row of the table in docs/paper.md."""
+    """A claim of the paper and our finding: a row of the table in docs/paper.md."""
 
     figure: str
-    """Of the paper, or `beyond`."""
+    """Figure of the paper, or `beyond`."""
     claim: str
     ours: str
     """The finding, with its figures."""
     holds: str
-    """`yes`, `no`, or what of it does."""
+    """`yes`, `no`, or the part that holds."""
 
 
 def conclude(journal: Journal, claims: Iterable[Claim], **findings: Any) -> None:
-    """Write what the rows say into the results file: the claims for docs/paper.md, and more."""
+    """Write the findings into the results file: the claims for docs/paper.md, and more."""
     journal.write({"claims": [claim._asdict() for claim in claims]} | findings)
 
 
@@ -263,7 +263,7 @@ def mean_interval(values: Num[np.ndarray, " n"]) -> str:
 
 
 def column(journal: Journal, group: str, frames: int, contestant: str, score: str) -> np.ndarray:
-    """One score of one contestant over all chairs of a group, in the order of the rows."""
+    """A score of a contestant over all chairs of a group, in the order of the rows."""
     rows = [row for row in journal.rows.values() if row["group"] == group]
     return np.array([row[str(frames)][contestant][score] for row in rows])
 
@@ -293,7 +293,7 @@ def summary(
     Args:
         journal: The rows.
         frames: Numbers of frames, one for each value of a curve.
-        more: Curves besides those of `curves_by_frames`, by group and name.
+        more: Further curves, by group and name.
     """
     curves = {group: curves_by_frames(journal, group, frames) for group in groups(journal)}
     return {
@@ -309,10 +309,10 @@ def plot_curves(stem: Path, journal: Journal, frames: Sequence[int], title: str)
     """Draw the curves by numbers of frames, a panel for each group of chairs.
 
     Args:
-        stem: Of the files, .png and .svg.
+        stem: Path of the files, without .png and .svg.
         journal: The rows.
         frames: Numbers of frames.
-        title: Of a panel, with places for the number of chairs and the name of their group.
+        title: Title of a panel, with places for the number of chairs and the name of their group.
     """
 
     def draw(figure: Any) -> None:

@@ -3,10 +3,10 @@ r"""How far meshes lie from the true surface: fused and completed, of voxels, an
     python experiments/surface_accuracy.py --meshes cad_chairs/
 
 Every eighth of the 78 CAD seats, seen by a Kinect's noisy frames along an orbit, with true poses.
-Three meshes: that of fused distances completed by the encoder's shape, with measured and predicted
-vertices told apart; that of composed voxels, smoothed, as before; and that of Open3D's block grid
-of signed distances with voxels of the same size (where open3d is installed). Distances from their
-vertices to the CAD surface, and from what the frames see of that surface to the mesh, in
+Three meshes are compared: fused distances completed by the encoder's shape, with measured and
+predicted vertices apart; composed voxels, smoothed, as before; and Open3D's block grid of signed
+distances with voxels of the same size (where open3d is installed). The figures are distances from
+their vertices to the CAD surface, and from the visible part of that surface to the mesh, in
 millimetres: mean and 90th percentile.
 
 Results: experiments/results/surface_accuracy.json; seats that are done are kept.
@@ -62,10 +62,10 @@ class Config:
     frames: tuple[int, ...] = (4, 18)
     """Numbers of frames that are fused."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs: does it run?"""
+    """Two procedural chairs, as a test."""
 
 
 def main(config: Config) -> None:
@@ -78,7 +78,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Measure the meshes of every chair, and write what was found."""
+    """Measure the meshes of every chair, and write the results."""
     prior = load_prior(config.weights)
     settings = {
         "set": "procedural" if config.meshes is None else "CAD",
@@ -202,7 +202,7 @@ def open3d_mesh(captured: Capture) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), process=False)
 
 
-# ------------------------------------------------------------------ what is found
+# ------------------------------------------------------------------ evaluation
 
 
 def means(journal: Journal) -> dict[str, dict[str, list[float]]]:

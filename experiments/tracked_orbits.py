@@ -1,16 +1,16 @@
-r"""Tracking and mapping of orbits whose poses are not given: drift, and what it does to the shape.
+r"""Tracking and mapping of orbits without given poses: drift, and its effect on the shape.
 
     python experiments/tracked_orbits.py --meshes cad_chairs/
 
 32 CAD seats, a full orbit each of 36 frames 10 degrees apart, 240 x 240 pixels with a Kinect's
 noise from 1.2 diagonals away. Given: the first pose and the object's box. Four systems: tracked
 against the last keyframe only or against the map as well, keyframes realigned with the refined
-shape or not; beside them, the shape with the true poses.
+shape or not; for comparison, the shape with the true poses.
 
 ATE is the root mean square, over the frames that were tracked, of the distance between the final
 and the true position of the camera, in mm: `ate` after the rigid motion that fits best, as is
 usual, `error` without any, for the first pose is given; in the figure `ate` as a share of the
-diagonal of the object's bounding box. IoU is that of the refined and of the composed surface voxels
+diagonal of the object's bounding box. IoU is given for the refined and the composed surface voxels
 after each keyframe.
 
 Results: experiments/results/tracked_orbits.json and .png; a seat that is done is not run again.
@@ -71,19 +71,19 @@ class Config:
     meshes: Path = Path("cad_chairs")
     """Folder or archive of seats, +y up and +z in front."""
     seats: int = 32
-    """How many of them, spread over all."""
+    """Number of seats, spread over all."""
     frames: int = 36
     step: float = 10.0
     """Degrees between frames."""
     distance: float = 1.2
-    """Of the camera from the object's centre, in diagonals of its bounding box."""
+    """Distance of the camera from the object's centre, in diagonals of its bounding box."""
     image_size: int = 240
     iterations: int = 20
-    """Of Adam after each keyframe."""
+    """Steps of Adam after each keyframe."""
     workers: int = 2
     results: Path = RESULTS
     smoke: bool = False
-    """One seat, few frames, in seconds: does it run?"""
+    """One seat, few frames, in seconds, as a test."""
 
 
 def main(config: Config) -> None:

@@ -1,4 +1,4 @@
-r"""What each choice in training is worth: small networks at equal budget, judged by what they find.
+r"""The value of each choice in training: small networks at equal budget, judged by their shapes.
 
     jaxshape dataset --output data/chairs --count 16000
     python experiments/training_choices.py --dataset data/chairs --meshes cad_chairs/
@@ -11,11 +11,11 @@ and, for the variant that learns from real chairs made of boxes (research data),
     python experiments/training_choices.py --dataset data/chairs --meshes cad_chairs/ \
         --boxes data/boxes
 
-For every variant of `VARIANTS` one network is trained from scratch on the same number of pairs and
-then judged on chairs nobody trained on, procedural ones and meshes if any are given: by the IoU of
-what the first code, CMA-ES and Adam find from 1, 4 and 8 frames of an orbit, by the ceiling of its
-space (codes fitted to the full truth), and by the first code's IoU from inputs with all faults at
-once. Training loss is not compared: the variants do not share one.
+For every variant of `VARIANTS` one network is trained from scratch on the same number of pairs. It
+is then judged on chairs that nobody trained on, procedural ones and meshes if any are given: by the
+IoU of the shapes of the first code, CMA-ES and Adam from 1, 4 and 8 frames of an orbit, by the
+ceiling of its space (codes fitted to the full truth), and by the first code's IoU from inputs with
+all faults at once. Training loss is not compared: the variants do not share one.
 
 A variant that is finished is not run again; one that was killed goes on from its checkpoint.
 Results: experiments/results/training_choices.json and .png. Time: about 2 minutes a variant on two
@@ -59,7 +59,7 @@ FAULTY = DatasetConfig(
 )
 """Inputs of the test of robustness: every fault, more of each than in training."""
 
-# Each group changes one thing. The first of a group is what the others are compared with.
+# Each group changes one thing. The others of a group are compared with its first.
 PLAIN = replace(PRESETS["autoencoder"], architecture=SMALL, inputs=UNCHANGED, occupied_weight=1.0)
 CONDITIONAL = replace(
     PRESETS["default"], architecture=Completion((16, 48, 64), 1), inputs=UNCHANGED, average=0.98
@@ -115,7 +115,7 @@ class Config:
     output: Path = Path("out/training_choices")
     """Folder for the runs."""
     variants: tuple[str, ...] = tuple(VARIANTS)
-    """Those to train; the figures of the others are kept."""
+    """Variants to train; the figures of the others are kept."""
     steps: int = 200
     """Batches of 32 pairs for each variant."""
     chairs: int = 12
@@ -125,7 +125,7 @@ class Config:
     every: int = 3
     """Use every n-th of these meshes."""
     iterations: int = 40
-    """Of the searches."""
+    """Iterations of the searches."""
     boxes: Path | None = None
     """Folder of a dataset of box chairs; without it that variant is left out."""
     results: Path = RESULTS
@@ -204,7 +204,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def line(name: str, scores: dict[str, Any]) -> str:
-    """One variant's figures in a line, on the hardest test set."""
+    """The figures of a variant in a line, on the hardest test set."""
     test = scores.get("meshes", scores["procedural"])
     by_frames = [
         f"{k}: " + "/".join(f"{test[k][m]['iou']:.3f}" for m in ("encoder", "cma", "gradient:adam"))

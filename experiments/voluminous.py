@@ -2,16 +2,16 @@ r"""IoU by number of frames on voluminous chairs alone (paper, Fig. true_false).
 
     python experiments/voluminous.py --test.meshes cad_chairs/
 
-Those of the 288 procedural chairs and 78 CAD seats whose surface encloses more than 0.35 of the
-grid, its own voxels counted: 19 and 4. Otherwise as in iou_by_frames.py: encoder, descent, Adam and
+Of the 288 procedural chairs and 78 CAD seats, the surface of 19 and 4 encloses more than 0.35 of
+the grid, its own voxels included. Otherwise as in iou_by_frames.py: encoder, descent, Adam and
 CMA-ES with equal iterations from 1 to 18 frames, and F with all occluded voxels set to empty and to
 full. Searches that iou_by_frames.py has done with the same settings are taken from its results.
 
-Also counted: how many of the occluded voxels are empty, which is what makes that bound good, where
-the truth is a surface, as everywhere here, and where it is a solid, with all that it encloses. No
-camera can ever see the inside; whether it is empty is a matter of what a shape is said to be.
+The share of empty voxels among the occluded ones, which makes that bound good, is given for true
+surfaces, as everywhere here, and for solids, with everything that a surface encloses. No camera can
+see the inside; whether it is empty depends on the definition of a shape.
 
-Results: experiments/results/voluminous.json, .png and .svg; chairs that are done are kept.
+Results: experiments/results/voluminous.json, .png and .svg; finished chairs are kept.
 Time: 5 minutes on two cores, less than one after iou_by_frames.py.
 """
 
@@ -71,12 +71,12 @@ class Config:
     frames: tuple[int, ...] = (1, 4, 8, 18)
     """Numbers of frames that are fused."""
     iterations: int = 60
-    """Of every search (paper: 350)."""
+    """Iterations of every search (paper: 350)."""
     weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; those of the package by default."""
+    """Weights of the shape prior; the package's by default."""
     results: Path = RESULTS
     smoke: bool = False
-    """Two procedural chairs and few iterations: does it run?"""
+    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
@@ -88,7 +88,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> Journal:
-    """Score every method on every voluminous chair, and write what was found."""
+    """Score every method on every voluminous chair, and write the results."""
     prior = load_prior(config.weights)
     settings = {
         "enclosed": config.enclosed,
@@ -110,7 +110,7 @@ def run(config: Config) -> Journal:
 
 
 def take_over(journal: Journal, chairs: list[Subject], config: Config, weights: str) -> None:
-    """Begin with what iou_by_frames.py has found with the same settings."""
+    """Begin with the results of iou_by_frames.py with the same settings."""
     same = {"frames": config.frames, "iterations": config.iterations, "weights": weights}
     found = Journal(config.results / "iou_by_frames.json", same).rows
     for name in {chair.name for chair in chairs} & found.keys() - journal.rows.keys():
@@ -118,7 +118,7 @@ def take_over(journal: Journal, chairs: list[Subject], config: Config, weights: 
         journal.rows[name] = {"group": found[name]["group"]} | scores
 
 
-# ------------------------------------------------------------------ chairs, and what they enclose
+# ------------------------------------------------------------------ chairs and solids
 
 
 def voluminous(test: TestSet, least: float) -> Iterator[Subject]:
@@ -135,7 +135,8 @@ def voluminous(test: TestSet, least: float) -> Iterator[Subject]:
 
 @jax.jit
 def solid(surface: Bool[Array, "*batch x y z"]) -> Bool[Array, "*batch x y z"]:
-    """A surface with all that it encloses: what no path of free voxels joins to the outside."""
+    """A surface with everything inside it: all voxels that no path of free voxels joins to the
+    outside."""
     batch = surface.ndim - 3
     free = jnp.pad(~surface, [(0, 0)] * batch + [(1, 1)] * 3, constant_values=True)
     around = jnp.zeros_like(free).at[..., 0, 0, 0].set(True)
@@ -154,7 +155,7 @@ def solid(surface: Bool[Array, "*batch x y z"]) -> Bool[Array, "*batch x y z"]:
 
 
 def measured(keys: Any, prior: ShapePrior, case: Case) -> Scores:
-    """The bounds, and how much of what is occluded is empty, for true surfaces and solids."""
+    """The bounds, and the empty share of the occluded voxels, for true surfaces and solids."""
     (occupied, occluded, _), surface = case
     filled = solid(surface)
     as_solid = bounds(occupied, occluded, filled)._asdict()
@@ -168,11 +169,11 @@ def measured(keys: Any, prior: ShapePrior, case: Case) -> Scores:
     }
 
 
-# ------------------------------------------------------------------ what is found
+# ------------------------------------------------------------------ evaluation
 
 
 def _inside(journal: Journal, config: Config, group: str) -> dict[str, list[np.ndarray]]:
-    """What the inside of the chairs makes of the bounds."""
+    """The bounds for solids, and the empty shares."""
     names = {
         "F, occluded empty, of solids": "solid_occluded_empty",
         "F, occluded full, of solids": "solid_occluded_full",
@@ -186,13 +187,13 @@ def _inside(journal: Journal, config: Config, group: str) -> dict[str, list[np.n
 
 
 def claims(journal: Journal, config: Config) -> list[Claim]:
-    """What the paper says of voluminous chairs, what is found, and what lies behind it."""
+    """The paper's claims about voluminous chairs, our findings, and the reason."""
     found = groups(journal)
     curves = {group: curves_by_frames(journal, group, config.frames) for group in found}
     inside = {group: _inside(journal, config, group) for group in found}
 
     def ahead(group: str, shape: str) -> list[np.ndarray]:
-        """By how much a shape's IoU is above that of F with what is occluded empty."""
+        """IoU of a shape minus the IoU of F with occluded voxels empty."""
         pairs = zip(curves[group][shape], curves[group]["F, occluded empty"], strict=True)
         return [ours - bound for ours, bound in pairs]
 
