@@ -14,7 +14,6 @@ Time: 15 minutes on two cores.
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,6 +22,7 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float, Int
 
+import study
 from figures import LINES, PAGE, draw_mean, save_column
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
@@ -47,7 +47,6 @@ from study import (
     mean_low_high,
 )
 
-RESULTS = Path(__file__).parent / "results"
 CHAIRS_AT_A_TIME = 8
 PAPER_CMA, PAPER_DESCENT = "CMA-ES, sigma0 2 in codes", "descent, step 0.14 in codes"
 
@@ -62,7 +61,7 @@ STYLES = LINES | {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(study.Config):
     """Settings of the experiment."""
 
     test: TestSet = TestSet(chairs=16, seats=12)
@@ -72,17 +71,10 @@ class Config:
     """Iterations of every search; none stops earlier."""
     early: int = 60
     """Iterations of the other experiments."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        test = replace(config.test, chairs=2, seats=0)
-        config = replace(config, test=test, iterations=2, early=1)
+    config = config.reduced(iterations=2, early=1)
     journal = run(config)
     plot(journal, config)
 
@@ -201,9 +193,7 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
     early_iou = sampled(config, 12).index(config.early)
 
     def scores(name: str, score: str) -> np.ndarray:
-        return np.concatenate(
-            [column(journal, group, config.frames, name, score) for group in groups(journal)]
-        )
+        return column(journal, None, config.frames, name, score)
 
     def last(name: str, score: str) -> np.ndarray:
         return scores(name, score)[:, -1]

@@ -16,8 +16,7 @@ Time: 16 minutes on two cores.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -26,6 +25,7 @@ import tyro
 from jaxtyping import Array, Float, Int
 from scipy.stats import spearmanr
 
+import study
 from figures import LINES, PAGE, interval, save_column
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
@@ -50,8 +50,6 @@ from study import (
     mean_interval,
 )
 
-RESULTS = Path(__file__).parent / "results"
-
 GRADIENT = 3
 """Decoder calls that a gradient counts as: 3.75 ms where a candidate takes 1.25 ms."""
 
@@ -71,7 +69,7 @@ GRADIENTS = ("gradient descent", "Adam", "L-BFGS")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(study.Config):
     """Settings of the experiment."""
 
     test: TestSet = TestSet(chairs=8, seats=8)
@@ -80,18 +78,11 @@ class Config:
     """Decoder calls after which shapes are scored; the last is the budget of every search."""
     searches: tuple[str, ...] = tuple(DRAWN)
     """Searches to compare, including CMA-ES."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few calls, as a test."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        test = replace(config.test, chairs=2, seats=0)
-        few = ("CMA-ES", "separable", "gradient descent", "Adam")
-        config = replace(config, test=test, budgets=(17, 34), searches=few)
+    few = ("CMA-ES", "separable", "gradient descent", "Adam")
+    config = config.reduced(budgets=(17, 34), searches=few)
     journal = run(config)
     plot(journal, config)
 
@@ -223,7 +214,7 @@ def _after(
 # ------------------------------------------------------------------ evaluation of the rows
 
 
-def curve(journal: Journal, config: Config, group: str, name: str, score: str) -> np.ndarray:
+def curve(journal: Journal, config: Config, group: str | None, name: str, score: str) -> np.ndarray:
     """A score of a search by chair, first the encoder's and then within each budget."""
     return column(journal, group, config.frames, name, score)
 
@@ -242,7 +233,7 @@ def shared_seconds(journal: Journal, config: Config) -> float:
 
 
 def at_time(
-    journal: Journal, config: Config, group: str, name: str, score: str, seconds: float
+    journal: Journal, config: Config, group: str | None, name: str, score: str, seconds: float
 ) -> np.ndarray:
     """A score by chair after some seconds, interpolated between budgets."""
     calls = seconds / seconds_per_call(journal, config, name)
@@ -251,7 +242,7 @@ def at_time(
 
 
 def agreement(
-    journal: Journal, config: Config, group: str, *, finished: bool = False
+    journal: Journal, config: Config, group: str | None, *, finished: bool = False
 ) -> np.ndarray:
     """Rank correlation by chair between a low objective and a high IoU.
 
@@ -271,7 +262,9 @@ def agreement(
     return np.nan_to_num(np.array(ranked))
 
 
-def last_half(journal: Journal, config: Config, group: str, name: str, score: str) -> np.ndarray:
+def last_half(
+    journal: Journal, config: Config, group: str | None, name: str, score: str
+) -> np.ndarray:
     """The change in the second half of the budget, by chair."""
     middle = 1 + int(np.searchsorted(config.budgets, config.budgets[-1] / 2))
     values = curve(journal, config, group, name, score)
@@ -321,14 +314,11 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
     """Claims of the paper, and further ones, over the chairs of all groups."""
     budget, whole = config.budgets[-1], shared_seconds(journal, config)
 
-    def pooled(values: Callable[[str], np.ndarray]) -> np.ndarray:
-        return np.concatenate([values(group) for group in groups(journal)])
-
     def at_calls(name: str, score: str = "iou") -> np.ndarray:
-        return pooled(lambda group: curve(journal, config, group, name, score)[:, -1])
+        return curve(journal, config, None, name, score)[:, -1]
 
     def in_seconds(name: str) -> np.ndarray:
-        return pooled(lambda group: at_time(journal, config, group, name, "iou", whole))
+        return at_time(journal, config, None, name, "iou", whole)
 
     def ahead(rival: str) -> np.ndarray:
         return at_calls("CMA-ES") - at_calls(rival)
@@ -345,16 +335,12 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         [name for name in names if name in config.searches]
         for names in (GRADIENTS, ("CMA-ES, 64", "CMA-ES, 256"))
     )
-    ended = pooled(lambda group: column(journal, group, config.frames, "CMA-ES", "ended"))
+    ended = column(journal, None, config.frames, "CMA-ES", "ended")
     lowest = min(config.searches, key=lambda name: at_calls(name, "objective").mean())
     objective, gain = (
-        pooled(lambda group: last_half(journal, config, group, lowest, score))  # noqa: B023
-        for score in ("objective", "iou")
+        last_half(journal, config, None, lowest, score) for score in ("objective", "iou")
     )
-    every, final = (
-        pooled(lambda group: agreement(journal, config, group, finished=end))  # noqa: B023
-        for end in (False, True)
-    )
+    every, final = (agreement(journal, config, None, finished=end) for end in (False, True))
     return [
         Claim(
             "Sec. 3.3",

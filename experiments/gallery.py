@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+import study
 from figures import save_column
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
@@ -39,7 +40,6 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct_jit, refiner_for
 from study import SEEN, TUNED, Claim, Subject, TestSet, conclude, subjects
 
-RESULTS = Path(__file__).parent / "results"
 CREATORS = Path(__file__).with_name("cad_seats.json")
 PERCENTILES = (25, 50, 75)
 WIDTH = 8.0  # inches, 1600 pixels
@@ -48,7 +48,7 @@ COLUMNS = {"F and M": BLUE, "encoder": PINK, "refined": ORANGE, "composed": ORAN
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(study.Config):
     """Settings of the experiment."""
 
     test: TestSet = TestSet(chairs=16, seats=16)
@@ -59,11 +59,6 @@ class Config:
     """Number of frames at which the gain decides which chairs are shown."""
     iterations: int = 60
     """Iterations of CMA-ES (paper: 350)."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 class Shown(NamedTuple):
@@ -79,9 +74,7 @@ class Shown(NamedTuple):
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        test = replace(config.test, chairs=2, seats=0)
-        config = replace(config, test=test, frames=(1, 4), iterations=2)
+    config = config.reduced(frames=(1, 4), iterations=2)
     shown = run(config)[1]
     if not shown:
         return

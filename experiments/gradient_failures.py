@@ -23,7 +23,6 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -33,6 +32,7 @@ import tyro
 from jaxtyping import Array, Float
 from rich.progress import track
 
+import study
 from figures import PAGE, save_column
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped
@@ -57,7 +57,6 @@ from study import (
     tuned,
 )
 
-RESULTS = Path(__file__).parent / "results"
 SHAPES = ("encoder", *TUNED)
 LEADS, TRAILS = "CMA-ES leads", "CMA-ES trails"
 POINTS = 21
@@ -69,7 +68,7 @@ Rows = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(study.Config):
     """Settings of the experiment."""
 
     test: TestSet = TestSet()
@@ -82,18 +81,10 @@ class Config:
     """Chairs to choose from where iou_by_frames.py has not been run."""
     short: int = 60
     """Iterations of the searches on the candidates."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        test = replace(config.test, chairs=2, seats=0)
-        few = {"frames": (4,), "examples": 1, "iterations": 2, "short": 2}
-        config = replace(config, test=test, **few)
+    config = config.reduced(frames=(4,), examples=1, iterations=2, short=2)
     journal = run(config)
     plot(journal, config)
 

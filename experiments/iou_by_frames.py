@@ -12,12 +12,14 @@ Results: experiments/results/iou_by_frames.json, .png and .svg; finished chairs 
 Time: 50 minutes on two cores.
 """
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import tyro
 
+import study
+from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.journal import Journal
 from study import (
@@ -26,6 +28,7 @@ from study import (
     column,
     compare,
     conclude,
+    gain,
     groups,
     mean_interval,
     measurement,
@@ -34,13 +37,13 @@ from study import (
     tuned,
 )
 
-RESULTS = Path(__file__).parent / "results"
 CLOSE = 0.01
 """IoU by which F may lie below CMA-ES and still be called its bound."""
+GRADIENTS = ("gradient descent", "Adam")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(study.Config):
     """Settings of the experiment."""
 
     test: TestSet = TestSet()
@@ -48,17 +51,10 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 60
     """Iterations of every search (paper: 350)."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        test = replace(config.test, chairs=2, seats=0)
-        config = replace(config, test=test, frames=(1, 4), iterations=2)
+    config = config.reduced(frames=(1, 4), iterations=2)
     journal = run(config)
     plot(journal, config)
 
@@ -66,84 +62,71 @@ def main(config: Config) -> None:
 def run(config: Config) -> Journal:
     """Score every method on every chair, and write the results."""
     prior = load_prior(config.weights)
-    settings = {
-        "frames": config.frames,
-        "iterations": config.iterations,
-        "weights": fingerprint(prior),
-    }
-    journal = Journal(config.results / "iou_by_frames.json", settings)
+    journal = Journal(config.results / "iou_by_frames.json", settings_of(config, prior))
     contestants = tuned(prior, config.iterations) | {"F": measurement}
     compare(contestants, prior, config.test, config.frames, journal)
     conclude(journal, claims(journal, config), summary=summary(journal, config.frames))
     return journal
 
 
+def settings_of(config: Config, prior: ShapePrior) -> dict[str, Any]:
+    """The settings under which rows are made."""
+    weights = fingerprint(prior)
+    return {"frames": config.frames, "iterations": config.iterations, "weights": weights}
+
+
 def claims(journal: Journal, config: Config) -> list[Claim]:
     """The paper's claims about this figure, and our findings."""
-    few, many = config.frames[0], config.frames[-1]
+    few, some, many = config.frames[0], config.frames[-2], config.frames[-1]
+    found = groups(journal)
 
-    def gain(group: str, better: str, worse: str, k: int) -> np.ndarray:
-        return column(journal, group, k, better, "iou") - column(journal, group, k, worse, "iou")
+    def ours(group: str, k: int, rival: str) -> np.ndarray:
+        return gain(journal, group, k, "CMA-ES", rival)
 
     def over_encoder(group: str) -> str:
-        first, last = (mean_interval(gain(group, "CMA-ES", "encoder", k)) for k in (few, many))
+        first, last = (mean_interval(ours(group, k, "encoder")) for k in (few, many))
         return f"{group}: {first} at {few}, {last} at {many} frames"
 
-    def over_descent(group: str) -> str:
-        descent, adam = (
-            mean_interval(gain(group, "CMA-ES", name, config.frames[-2]))
-            for name in ("gradient descent", "Adam")
-        )
+    def over_gradients(group: str) -> str:
+        descent, adam = (mean_interval(ours(group, some, name)) for name in GRADIENTS)
         return f"{group}: {descent} over descent, {adam} over Adam"
 
-    def bound(group: str) -> str:
-        F, found = (
-            column(journal, group, many, *names).mean()
-            for names in (("F", "occluded_empty"), ("CMA-ES", "iou"))
-        )
-        return f"{group}: F {F:.3f}, CMA-ES {found:.3f} at {many} frames"
+    def bound_and_iou(group: str, k: int) -> tuple[float, float]:
+        pairs = (("F", "occluded_empty"), ("CMA-ES", "iou"))
+        bound, reached = (column(journal, group, k, *pair).mean() for pair in pairs)
+        return bound, reached
 
-    found = groups(journal)
-    gains = [gain(group, "CMA-ES", "encoder", k) for group in found for k in (few, many)]
-    grows = all(
-        last.mean() > first.mean() > 0 for first, last in zip(*[iter(gains)] * 2, strict=True)
+    def bound(group: str) -> str:
+        F, reached = bound_and_iou(group, many)
+        return f"{group}: F {F:.3f}, CMA-ES {reached:.3f} at {many} frames"
+
+    def is_bound(k: int) -> bool:
+        return all(F > reached - CLOSE for F, reached in (bound_and_iou(g, k) for g in found))
+
+    first, last = ([ours(g, k, "encoder").mean() for g in found] for k in (few, many))
+    over_descent, over_adam = (
+        all(ours(g, k, name).mean() > 0 for g in found for k in config.frames) for name in GRADIENTS
     )
-    over = {
-        name: all(
-            gain(group, "CMA-ES", name, k).mean() > 0 for group in found for k in config.frames
-        )
-        for name in ("gradient descent", "Adam")
-    }
-    is_close = {
-        k: all(
-            np.mean(column(journal, group, k, "F", "occluded_empty"))
-            > np.mean(column(journal, group, k, "CMA-ES", "iou")) - CLOSE
-            for group in found
-        )
-        for k in (few, many)
-    }
     return [
         Claim(
             "Fig. IoU-error",
             "CMA-ES refinement beats the auto-encoder, most with many frames",
             "IoU gained, " + "; ".join(map(over_encoder, found)),
-            "yes" if grows else "partly",
+            "yes" if all(b > a > 0 for a, b in zip(first, last, strict=True)) else "partly",
         ),
         Claim(
             "Fig. IoU-error",
             "Gradient descent cannot outperform CMA-ES on average",
-            f"IoU of CMA-ES at {config.frames[-2]} frames, " + "; ".join(map(over_descent, found)),
-            "yes"
-            if all(over.values())
-            else "true of plain descent only"
-            if over["gradient descent"]
-            else "no",
+            f"IoU of CMA-ES at {some} frames, " + "; ".join(map(over_gradients, found)),
+            {(True, True): "yes", (True, False): "true of plain descent only"}.get(
+                (over_descent, over_adam), "no"
+            ),
         ),
         Claim(
             "Fig. IoU-error",
             "F with occluded voxels empty is a very accurate upper bound",
             "; ".join(map(bound, found)),
-            "yes" if is_close[few] else "at many frames only" if is_close[many] else "no",
+            "yes" if is_bound(few) else "at many frames only" if is_bound(many) else "no",
         ),
     ]
 

@@ -17,7 +17,6 @@ Time: 16 minutes on two cores.
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -25,6 +24,7 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Bool, Float
 
+import study
 from figures import PAGE, interval, save_column
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode, encode
@@ -45,15 +45,12 @@ from study import (
     Contestant,
     TestSet,
     by_method,
-    column,
     compare,
     conclude,
-    groups,
+    gain,
     mean_interval,
     mean_low_high,
 )
-
-RESULTS = Path(__file__).parent / "results"
 
 
 @dataclass(frozen=True)
@@ -70,6 +67,7 @@ class Residual:
     search: RefineConfig = RefineConfig()
 
 
+SCORES = ("iou", "iou_composed")
 COMMON = Residual()
 QUARTERS = replace(COMMON, prior_scales=(1.0,) * 4)
 CODES = RefineConfig(space="raw", step_size=0.03)
@@ -98,7 +96,7 @@ NOISY = (PAPER, "occupied weight 3", "occupied weight 5", DEFAULT, "alpha x 10",
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(study.Config):
     """Settings of the experiment."""
 
     test: TestSet = TestSet(chairs=24, seats=16)
@@ -106,19 +104,11 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 48
     """Steps of Adam."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
-    residuals = RESIDUALS
-    if config.smoke:
-        test = replace(config.test, chairs=2, seats=0)
-        config = replace(config, test=test, iterations=4)
-        residuals = {name: RESIDUALS[name] for name in (PAPER, DEFAULT)}
+    config = config.reduced(iterations=4)
+    residuals = {name: RESIDUALS[name] for name in (PAPER, DEFAULT)} if config.smoke else RESIDUALS
     clean, noisy = run(config, residuals)
     plot({"no noise": clean, "a real sensor's noise": noisy}, config)
 
@@ -180,18 +170,13 @@ def printed_alpha(occluded: Bool[Array, "case x y z"]) -> Float[Array, "case 1 1
     return jnp.maximum(count, 1) / jnp.maximum((~occluded).sum((1, 2, 3), keepdims=True), 1)
 
 
-def gain(journal: Journal, frames: int, name: str, score: str = "iou") -> np.ndarray:
-    """Gain of a residual over the encoder, for every chair."""
-    chairs = [column(journal, group, frames, name, score) for group in groups(journal)]
-    before = [column(journal, group, frames, "encoder", score) for group in groups(journal)]
-    return np.concatenate(chairs) - np.concatenate(before)
-
-
 def summary(journal: Journal, config: Config) -> dict[str, Any]:
     """`summary[residual][frames]`: gains over the encoder, each as [mean, low, high]."""
 
     def gains(name: str, k: int) -> dict[str, list[float]]:
-        each = {score: gain(journal, k, name, score) for score in ("iou", "iou_composed")}
+        each = {
+            score: gain(journal, None, k, name, score=score) for score in ("iou", "iou_composed")
+        }
         return {score: mean_low_high(v) for score, v in each.items()}
 
     return {
@@ -209,15 +194,15 @@ def claims(clean: Journal, noisy: Journal, config: Config) -> list[Claim]:
     few, some = config.frames[:2]
 
     def gains(journal: Journal, name: str, score: str = "iou") -> str:
-        each = [f"{gain(journal, k, name, score).mean():+.3f}" for k in config.frames]
+        each = [f"{gain(journal, None, k, name, score=score).mean():+.3f}" for k in config.frames]
         return " / ".join(each)
 
     def over_paper(journal: Journal) -> str:
         return mean_interval(overall(journal, config, DEFAULT) - overall(journal, config, PAPER))
 
-    paper = {k: interval(gain(clean, k, PAPER)) for k in config.frames}
-    helped = np.mean([gain(clean, k, DEFAULT) for k in config.frames[1:]])
-    printed = np.mean([gain(clean, k, PAPER) for k in config.frames[1:]])
+    paper = {k: interval(gain(clean, None, k, PAPER)) for k in config.frames}
+    helped = np.mean([gain(clean, None, k, DEFAULT) for k in config.frames[1:]])
+    printed = np.mean([gain(clean, None, k, PAPER) for k in config.frames[1:]])
     at = f"at {' / '.join(map(str, config.frames))} frames"
     best = max(_names(clean, config), key=lambda name: overall(clean, config, name).mean())
     return [
@@ -248,7 +233,11 @@ def claims(clean: Journal, noisy: Journal, config: Config) -> list[Claim]:
 
 def overall(journal: Journal, config: Config, name: str) -> np.ndarray:
     """Gain of each chair over the encoder, mean over decoded and composed, and over frames."""
-    each = [gain(journal, k, name, s) for k in config.frames for s in ("iou", "iou_composed")]
+    each = [
+        gain(journal, None, k, name, score=s)
+        for k in config.frames
+        for s in ("iou", "iou_composed")
+    ]
     return np.mean(each, axis=0)
 
 
@@ -261,10 +250,10 @@ def plot(journals: dict[str, Journal], config: Config) -> None:
         heights = [len(one) for one in names.values()]
         panels = figure.subplots(2, 2, sharey="row", height_ratios=heights)
         for row, (noise, journal) in zip(panels, journals.items(), strict=True):
-            for axes, score in zip(row, ("iou", "iou_composed"), strict=True):
+            for axes, score in zip(row, SCORES, strict=True):
                 for i, name in enumerate(names[noise]):
                     for j, (k, color) in enumerate(zip(config.frames, colors, strict=False)):
-                        values = gain(journal, k, name, score)
+                        values = gain(journal, None, k, name, score=score)
                         low, high = interval(values)
                         y = i + 0.24 * (1 - j)
                         axes.plot([low, high], [y, y], color=color, linewidth=1.4)

@@ -16,7 +16,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -25,6 +24,7 @@ import numpy as np
 import tyro
 from jaxtyping import Array
 
+import study
 from figures import PAGE, draw_mean, save_column
 from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.geometry.overlap import iou
@@ -47,7 +47,6 @@ from study import (
     mean_interval,
 )
 
-RESULTS = Path(__file__).parent / "results"
 CASES_AT_A_TIME = 15
 WORST = 99.0
 """Stands for a loss that is not finite, which JSON does not have."""
@@ -86,7 +85,7 @@ TRIALS = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(study.Config):
     """Settings of the experiment."""
 
     test: TestSet = TestSet(chairs=8, seats=4)
@@ -94,17 +93,10 @@ class Config:
     """Numbers of frames that are fused."""
     iterations: int = 60
     """Iterations of every search."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        test = replace(config.test, chairs=2, seats=0)
-        config = replace(config, test=test, frames=(1, 4), iterations=2)
+    config = config.reduced(frames=(1, 4), iterations=2)
     journal = run(config)
     plot(journal, config)
     plot_curves(journal, config)

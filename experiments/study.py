@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,8 @@ from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct, refiner_for
+
+RESULTS = Path(__file__).parent / "results"
 
 CASES_AT_A_TIME = 64
 """Cases searched together, unless a chair has more: the rows between two entries of the journal."""
@@ -63,6 +65,24 @@ class TestSet:
     """CAD seats at most."""
     meshes: Path = Path("cad_chairs")
     """Folder of the CAD seats, as experiments/cad_seats.py writes it."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings that the scripts of the paper share."""
+
+    test: TestSet = TestSet()
+    weights: Path = Path("chair-autoencoder")
+    """Weights of the shape prior; the package's by default."""
+    results: Path = RESULTS
+    smoke: bool = False
+    """Few procedural chairs and iterations, as a test."""
+
+    def reduced(self, *, chairs: int = 2, **few: Any) -> Self:
+        """The settings of the run: with few chairs and other small settings for a smoke test."""
+        if not self.smoke:
+            return self
+        return replace(self, test=replace(self.test, chairs=chairs, seats=0), **few)
 
 
 class Subject(NamedTuple):
@@ -262,10 +282,25 @@ def mean_interval(values: Num[np.ndarray, " n"]) -> str:
     return f"{mean:+.3f} ({low:.3f} to {high:.3f})"
 
 
-def column(journal: Journal, group: str, frames: int, contestant: str, score: str) -> np.ndarray:
-    """A score of a contestant over all chairs of a group, in the order of the rows."""
-    rows = [row for row in journal.rows.values() if row["group"] == group]
+def column(
+    journal: Journal, group: str | None, frames: int, contestant: str, score: str
+) -> np.ndarray:
+    """A score of a contestant over all chairs of a group, or of all groups in turn."""
+    chosen = groups(journal) if group is None else [group]
+    rows = [row for name in chosen for row in journal.rows.values() if row["group"] == name]
     return np.array([row[str(frames)][contestant][score] for row in rows])
+
+
+def gain(
+    journal: Journal,
+    group: str | None,
+    frames: int,
+    better: str,
+    worse: str = "encoder",
+    score: str = "iou",
+) -> np.ndarray:
+    """A score of one contestant minus the same score of another, by chair."""
+    return np.subtract(*[column(journal, group, frames, name, score) for name in (better, worse)])
 
 
 def curves_by_frames(

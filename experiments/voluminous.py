@@ -5,19 +5,18 @@ r"""IoU by number of frames on voluminous chairs alone (paper, Fig. true_false).
 Of the 288 procedural chairs and 78 CAD seats, the surface of 19 and 4 encloses more than 0.35 of
 the grid, its own voxels included. Otherwise as in iou_by_frames.py: encoder, descent, Adam and
 CMA-ES with equal iterations from 1 to 18 frames, and F with all occluded voxels set to empty and to
-full. Searches that iou_by_frames.py has done with the same settings are taken from its results.
+full. The searches are the rows of iou_by_frames.py, which runs first where it has not been run.
 
 The share of empty voxels among the occluded ones, which makes that bound good, is given for true
 surfaces, as everywhere here, and for solids, with everything that a surface encloses. No camera can
 see the inside; whether it is empty depends on the definition of a shape.
 
 Results: experiments/results/voluminous.json, .png and .svg; finished chairs are kept.
-Time: 5 minutes on two cores, less than one after iou_by_frames.py.
+Time: less than a minute on two cores after iou_by_frames.py.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -27,17 +26,17 @@ import tyro
 from jaxtyping import Array, Bool
 from rich.progress import track
 
+import iou_by_frames
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.dataset import load_object
 from jaxshape.data.meshes import Skipped, sample_surface
 from jaxshape.geometry.grid import fit_box
 from jaxshape.model.shapes import ShapePrior
-from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.model.weights import load_prior
 from jaxshape.results.evaluation import Case
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds
 from study import (
-    TUNED,
     Claim,
     Scores,
     Subject,
@@ -51,71 +50,46 @@ from study import (
     plot_curves,
     subjects,
     summary,
-    tuned,
 )
 
-RESULTS = Path(__file__).parent / "results"
-CHAIRS_AT_A_TIME = 13
-"""The voluminous chairs make two batches."""
-METHODS = ("encoder", *TUNED)
+EMPTY, SOLID_EMPTY = (
+    "occluded voxels that are empty",
+    "occluded voxels that are empty, of solids",
+)
+BOUNDS = ("F, occluded empty, of solids", "F, occluded full, of solids")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(iou_by_frames.Config):
     """Settings of the experiment."""
 
-    test: TestSet = TestSet()
-    """The chairs among which voluminous ones are looked for."""
     enclosed: float = 0.35
     """Fraction of the grid that a voluminous chair encloses at least."""
-    frames: tuple[int, ...] = (1, 4, 8, 18)
-    """Numbers of frames that are fused."""
-    iterations: int = 60
-    """Iterations of every search (paper: 350)."""
-    weights: Path = Path("chair-autoencoder")
-    """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        test = replace(config.test, chairs=11, seats=0)  # the first two that are voluminous
-        config = replace(config, test=test, frames=(1, 4), iterations=2)
-    journal = run(config)
-    plot(journal, config)
+    # the first two voluminous chairs are among the first eleven
+    config = config.reduced(chairs=11, frames=(1, 4), iterations=2)
+    plot(run(config), config)
 
 
 def run(config: Config) -> Journal:
-    """Score every method on every voluminous chair, and write the results."""
+    """Take the searches of iou_by_frames.py on voluminous chairs, and add the bounds for solids."""
     prior = load_prior(config.weights)
-    settings = {
-        "enclosed": config.enclosed,
-        "frames": config.frames,
-        "iterations": config.iterations,
-        "weights": fingerprint(prior),
-    }
+    settings = {"enclosed": config.enclosed} | iou_by_frames.settings_of(config, prior)
     journal = Journal(config.results / "voluminous.json", settings)
-    contestants = tuned(prior, config.iterations)
     chairs = list(voluminous(config.test, config.enclosed))
-    take_over(journal, chairs, config, fingerprint(prior))
-    contestants["F"] = measured
-    at_a_time = CHAIRS_AT_A_TIME * len(config.frames)
-    compare(contestants, prior, chairs, config.frames, journal, at_a_time=at_a_time)
+    searched = iou_by_frames.run(config).rows
+    for name in {chair.name for chair in chairs} & searched.keys() - journal.rows.keys():
+        scores = {str(k): dict(searched[name][str(k)]) for k in config.frames}
+        for one in scores.values():
+            del one["F"]
+        journal.rows[name] = {"group": searched[name]["group"]} | scores
+    compare({"F": measured}, prior, chairs, config.frames, journal)
     inside = {group: _inside(journal, config, group) for group in groups(journal)}
     found = summary(journal, config.frames, inside)
     conclude(journal, claims(journal, config), summary=found)
     return journal
-
-
-def take_over(journal: Journal, chairs: list[Subject], config: Config, weights: str) -> None:
-    """Begin with the results of iou_by_frames.py with the same settings."""
-    same = {"frames": config.frames, "iterations": config.iterations, "weights": weights}
-    found = Journal(config.results / "iou_by_frames.json", same).rows
-    for name in {chair.name for chair in chairs} & found.keys() - journal.rows.keys():
-        scores = {str(k): {m: found[name][str(k)][m] for m in METHODS} for k in config.frames}
-        journal.rows[name] = {"group": found[name]["group"]} | scores
 
 
 # ------------------------------------------------------------------ chairs and solids
@@ -174,15 +148,10 @@ def measured(keys: Any, prior: ShapePrior, case: Case) -> Scores:
 
 def _inside(journal: Journal, config: Config, group: str) -> dict[str, list[np.ndarray]]:
     """The bounds for solids, and the empty shares."""
-    names = {
-        "F, occluded empty, of solids": "solid_occluded_empty",
-        "F, occluded full, of solids": "solid_occluded_full",
-        "occluded voxels that are empty": "empty",
-        "occluded voxels that are empty, of solids": "solid_empty",
-    }
+    scores = ("solid_occluded_empty", "solid_occluded_full", "empty", "solid_empty")
     return {
         name: [column(journal, group, k, "F", score) for k in config.frames]
-        for name, score in names.items()
+        for name, score in zip((*BOUNDS, EMPTY, SOLID_EMPTY), scores, strict=True)
     }
 
 
@@ -219,20 +188,15 @@ def claims(journal: Journal, config: Config) -> list[Claim]:
         return [inside[group][name][-1].mean() for name in names]
 
     def tell_empty(group: str) -> str:
-        surface, filled = means(
-            group, "occluded voxels that are empty", "occluded voxels that are empty, of solids"
-        )
-        empty, full = means(group, "F, occluded empty, of solids", "F, occluded full, of solids")
+        surface, filled, empty, full = means(group, EMPTY, SOLID_EMPTY, *BOUNDS)
         return (
             f"{group}: {surface:.0%} in surface grids, {filled:.0%} in solid grids; "
             f"IoU of F for solids {empty:.3f} with occluded voxels empty, {full:.3f} with them full"
         )
 
     at = " / ".join(map(str, config.frames))
-    mostly = (
-        all(means(group, "occluded voxels that are empty")[0] > 0.5 for group in found),
-        all(means(group, "occluded voxels that are empty, of solids")[0] > 0.5 for group in found),
-    )
+    shares = [means(group, EMPTY, SOLID_EMPTY) for group in found]
+    mostly = tuple(all(share > 0.5 for share in column) for column in zip(*shares, strict=True))
     return [
         Claim(
             "Fig. true_false",
