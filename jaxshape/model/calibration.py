@@ -1,4 +1,4 @@
-"""What decoded logits are worth as probabilities.
+"""Calibration of decoded logits as probabilities.
 
 Networks are too sure of voxels that nobody saw. Three numbers, fitted to objects that the network
 was not trained on and stored with its weights, correct that: see `Calibration`.

@@ -4,11 +4,24 @@ import importlib
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from PIL import Image
 
 SCRIPTS = ["convergence", "iou_by_frames", "objective"]
 LONG = ["step_size", "voluminous", "gallery", "gradient_failures", "equal_budget"]
+
+
+def check_claims_of_iou(content):
+    """The first claim holds if the gains, computed again from the rows, are positive and grow."""
+    few, many = (
+        np.mean([row[k]["CMA-ES"]["iou"] - row[k]["encoder"]["iou"] for row in rows])
+        for rows in [content["rows"].values()]
+        for k in ("1", "4")
+    )
+    claim = content["claims"][0]
+    assert claim["holds"] == ("yes" if many > few > 0 else "partly")
+    assert f"{few:+.3f} (" in claim["ours"] and f"{many:+.3f} (" in claim["ours"]
 
 
 @pytest.mark.parametrize(
@@ -25,6 +38,8 @@ def test_smoke(name, linear_weights, tmp_path, request):
     for claim in content["claims"]:
         assert set(claim) == {"figure", "claim", "ours", "holds"} and all(claim.values())
         assert "nan" not in claim["ours"]
+    if name == "iou_by_frames":
+        check_claims_of_iou(content)
     with Image.open(tmp_path / f"{name}.png") as image:
         assert image.size[0] >= 700 and image.convert("L").getextrema()[0] < 128  # not blank
     assert "<svg" in (tmp_path / f"{name}.svg").read_text()

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from drawn import is_drawn
 
 from jaxshape.data.building import build_dataset
 from jaxshape.data.config import DatasetConfig
@@ -25,4 +26,4 @@ def test_smoke(tmp_path):
     found = json.loads((tmp_path / "out" / "training_choices.json").read_text())
     assert set(found) == {"plain", "code 32"} and "step 1" in first.stdout
     assert 0 <= found["plain"]["procedural"]["8"]["bounds"]["ceiling"] <= 1
-    assert (tmp_path / "out" / "training_choices.png").stat().st_size > 10_000
+    assert is_drawn(tmp_path / "out" / "training_choices.png")

@@ -81,8 +81,12 @@ def test_restarts_are_marked_in_every_panel(drawn_by):
 
 @pytest.mark.parametrize("spread, panels", [(0.1, 2), (0.0, 1)])
 def test_without_a_distribution_there_are_losses_and_spread_if_any(drawn_by, spread, panels):
-    figure = drawn_by(plot_search, make_search(drawn=False, spread=spread))
-    assert len(figure.axes) == panels
+    search = make_search(drawn=False, spread=spread)
+    first, *others = drawn_by(plot_search, search).axes
+    np.testing.assert_array_equal(first.lines[0].get_xdata(), EVALUATIONS)
+    assert len(others) == panels - 1
+    for axes in others:
+        np.testing.assert_allclose(axes.lines[0].get_ydata(), search.trace.spread)
 
 
 def test_a_comparison_has_a_line_for_each_search(drawn_by):
