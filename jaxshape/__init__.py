@@ -12,9 +12,9 @@ Conventions, stated here once:
 
 - Object frame: right-handed, +y up, the object's front along +z, metres. A CAD model's bounding box
   is centred at the origin.
-- Camera: OpenCV (x right, y down, z forward). Depth is z, not ray length, in metres; 0 means that
-  nothing is known, infinity that the ray met nothing. The centre of pixel (row, column) is at
-  (u, v) = (column + 0.5, row + 0.5).
+- Camera: OpenCV (x right, y down, z forward). Depth is z, not ray length, in metres; 0 stands for
+  an unknown depth, infinity for a ray that met nothing. The centre of pixel (row, column) is at (u,
+  v) = (column + 0.5, row + 0.5).
 - Poses: `T_a_b` takes points of frame b to frame a, `p_a = T_a_b @ p_b`; `T_world_camera` is camera
   to world. `jaxlie.SE3` in JAX, 4x4 matrices in files.
 - Grids are indexed `[x, y, z]`, 32^3 unless a prior was trained otherwise. Voxel i covers

@@ -21,7 +21,7 @@ class BadSetting(ValueError):
     Attributes:
         name: Name of the field.
         value: The refused value.
-        wanted: What the field takes, as the end of a sentence that begins with "give".
+        wanted: Description of valid values, as the end of a sentence that begins with "give".
     """
 
     def __init__(self, name: str, value: Any, wanted: str) -> None:
@@ -35,7 +35,7 @@ def refuse(name: str, value: Any, wanted: str) -> NoReturn:
     Args:
         name: Name of the field.
         value: The refused value.
-        wanted: What the field takes, as the end of a sentence that begins with "give".
+        wanted: Description of valid values, as the end of a sentence that begins with "give".
 
     Raises:
         BadSetting: Always.
@@ -88,7 +88,7 @@ def positive(name: str, value: Any, unit: str = "") -> None:
     Args:
         name: Name of the field.
         value: The value to check.
-        unit: Its unit in the plural, as "metres"; empty where it has none.
+        unit: Unit in the plural, as "metres"; empty without a unit.
     """
     if not (is_traced(value) or _is_number(value) and 0 < value < math.inf):
         refuse(name, value, f"a number of {unit} above 0" if unit else "a number above 0")

@@ -17,10 +17,10 @@ except ImportError:  # on Windows
 
 
 class Output(NamedTuple):
-    """What a command is going to write.
+    """The output of a command.
 
     Attributes:
-        path: Its folder or file.
+        path: Folder or file of the output.
         is_file: Whether it is one file.
         goes_on: Whether the same command, given again, goes on where it was stopped.
         needs: Free bytes without which it is not begun.
@@ -38,7 +38,7 @@ class Output(NamedTuple):
 
     @property
     def kept(self) -> str:
-        """What is left of a command that was stopped, as a sentence."""
+        """The files left by a stopped command, as a sentence."""
         if self.goes_on:
             return "What was finished is kept; the same command goes on from there."
         return "Give the same command again to make it anew."
@@ -52,7 +52,7 @@ def claimed(output: Output) -> Iterator[None]:
     writer left half done is removed.
 
     Args:
-        output: What is going to be written.
+        output: The output to claim.
 
     Raises:
         OutputError: It cannot be written, is too small, or another process is writing it.

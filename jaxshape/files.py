@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 TEMPORARY = ".writing-"
-"""How the names of files begin that are being written."""
+"""Prefix of the names of files that are being written."""
 
 _REASONS = {
     errno.ENOSPC: "the disk is full",
@@ -35,7 +35,7 @@ def unwritable(folder: Path, problem: Exception) -> OutputError | None:
 
     Args:
         folder: The folder.
-        problem: What a write raised.
+        problem: The error of a write.
 
     Returns:
         The error; None where the problem is another.

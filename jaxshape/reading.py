@@ -111,7 +111,7 @@ def read_json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def parse_json(text: str) -> Any:
-    """What a JSON text stands for; whole numbers that nothing has so many of become floats.
+    """The value of a JSON text; whole numbers beyond 18 digits become floats.
 
     Args:
         text: The text.
@@ -130,7 +130,7 @@ def parse_json(text: str) -> Any:
 
 
 def _nesting(text: str) -> int:
-    """How many brackets outside of quotes are open at the same time, at most."""
+    """The largest number of brackets, outside of quotes, that are open at the same time."""
     if text.count("[") + text.count("{") <= limits.JSON_NESTING:
         return 0
     outside = _TEXT.sub("", text).translate(_BRACKETS)

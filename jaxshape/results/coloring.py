@@ -65,12 +65,12 @@ def color_vertices(
     """Colours of the vertices of a mesh.
 
     Args:
-        mesh: In the object frame, in metres.
+        mesh: Mesh in the object frame, in metres.
         measured: True for vertices on the measured surface; the others are neutral.
         views: Frames that may show it.
         reach: Metres over which measured vertices that no frame shows take over a colour nearby,
             and a quarter of which a depth may differ beyond the sensor's noise.
-        sensor: How the noise of depth grows.
+        sensor: Noise of the camera's depth.
 
     Returns:
         One colour for each vertex; None where there are no frames.
@@ -99,7 +99,7 @@ def _shown(
     reach: float,
     sensor: Sensor,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """How well a frame shows each point, 0 where it does not, and the colours it shows."""
+    """The quality of a frame's view of each point, 0 where hidden, and the colours it shows."""
     R, t = view.T_object_camera[:3, :3], view.T_object_camera[:3, 3]
     fx, fy, cx, cy = view.intrinsics
     x, y, z = ((points - t) @ R).T

@@ -46,8 +46,8 @@ class EvaluateConfig(CameraConfig):
         camera: Name of the depth camera, see `jaxshape.data.virtual_cameras`.
         noise: Give the depth images the faults of the camera's sensor; None for all but the paper's
             camera.
-        fusion: How frames become F and M, "distance" or "points"; None for points where the paper's
-            camera has no noise, distances elsewhere.
+        fusion: Method that turns frames into F and M, "distance" or "points"; None for points where
+            the paper's camera has no noise, distances elsewhere.
         ceiling: Add to the bounds the best that the space could hold, `fit_surface`, whatever was
             seen.
         refine: Settings of the searches.

@@ -33,7 +33,7 @@ NATS = 0.25
 """Logits at the decoded surface: above 0, for occupied voxels reach beyond what they hold."""
 
 NATS_PER_VOXEL = 6.0
-"""How steeply logits rise across a decoded surface."""
+"""Slope of logits across a decoded surface."""
 
 DEEP = 1.5
 """Fine voxels behind a surface down to which its distances are taken as they are."""
@@ -56,9 +56,9 @@ class FusedSurface(NamedTuple):
     """A mesh, and where it comes from.
 
     Attributes:
-        mesh: In the object frame, metres; normals point outwards.
+        mesh: Mesh in the object frame, in metres; normals point outwards.
         measured: True for vertices on the measured surface, False for predicted ones.
-        dropped: How many loose pieces were left out.
+        dropped: Number of loose pieces that were left out.
     """
 
     mesh: trimesh.Trimesh
@@ -72,9 +72,9 @@ def fuse_surface(
     """The measured surface, completed by the decoded shape where nothing was measured.
 
     Args:
-        field: Of one object, on a grid whose side is a multiple of that of the logits.
-        logits: Its decoded shape.
-        frame: Of the decoded grid, in the object frame.
+        field: Field of one object, on a grid whose side is a multiple of the logits' side.
+        logits: Logits of the decoded shape.
+        frame: Frame of the decoded grid, in the object frame.
 
     Returns:
         A closed mesh, except for loose pieces that touch neither the largest piece nor the floor.
@@ -110,8 +110,8 @@ def combine(
     """Signed distances of the whole shape, and those that were measured.
 
     Args:
-        field: Of one object.
-        logits: Its decoded shape.
+        field: Field of one object.
+        logits: Logits of the decoded shape.
         voxel: Metres that count as 1 in the distances: the side of a fine voxel.
 
     Returns:

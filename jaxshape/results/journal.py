@@ -1,4 +1,4 @@
-"""Rows of a long run, kept as they come: a killed run goes on after its last row. [host]"""
+"""Rows of a long run, written as they come: a killed run resumes after its last row. [host]"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -52,19 +52,19 @@ class Journal:
             self.write({})
 
     def write(self, findings: dict[str, Any]) -> None:
-        """Write the file anew, with what the rows say put before them."""
+        """Write the file again, with the findings before the rows."""
         about = {"settings": self.settings, "seconds": round(self.seconds, 1)}
         content = json.dumps(about | findings, indent=1)[:-2]
         rows = ",\n".join(f"  {json.dumps(k)}: {json.dumps(v)}" for k, v in self.rows.items())
         write_text(self.path, f'{content},\n "rows": {{\n{rows}\n }}\n}}\n')
 
     def remove(self) -> None:
-        """Remove the file, where what the rows come to stands elsewhere."""
+        """Remove the file, where the findings are stored elsewhere."""
         self.path.unlink(missing_ok=True)
 
 
 class Share(NamedTuple):
-    """What one of several processes does of a list: every n-th entry.
+    """The share of one of several processes in a list: every n-th entry.
 
     Attributes:
         index: Number of the process, from 0.

@@ -13,8 +13,8 @@ class Figure(NamedTuple):
 
     Attributes:
         name: Name of the figure.
-        value: Its value, with a unit.
-        meaning: What the value means, in words.
+        value: Value of the figure, with a unit.
+        meaning: Meaning of the value, in words.
     """
 
     name: str
