@@ -57,7 +57,7 @@ def run(tmp_path, monkeypatch, unchecked_types, linear_weights):
         code = (NOTEBOOKS / f"{name}.py").read_text()
         for said, done in SMALL[name].items():
             assert said in code, f"{name} no longer says {said!r}"
-            code = code.replace(said, done.replace("VirtualCamera", "js.VirtualCamera"))
+            code = code.replace(said, done)
         quick = f"js.load_prior({str(linear_weights)!r})"
         code = re.sub(r'js\.load_prior\(("chair-autoencoder")?\)', quick, code)
         monkeypatch.chdir(tmp_path)
