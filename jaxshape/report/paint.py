@@ -42,6 +42,6 @@ def paints(found: ResultFolder) -> dict[str, Paint]:
         by_source = np.where(found.measured[:, None], blue, orange)
         there["source"] = Paint("measured (blue), predicted (orange)", by_source)
     if found.confidence is not None:
-        shades = np.uint8(255 * colormaps["viridis"](found.confidence)[:, :3])
+        shades = (255 * colormaps["viridis"](found.confidence)[:, :3]).astype(np.uint8)
         there["confidence"] = Paint("how sure: 0 (violet) to 1 (yellow)", shades)
     return there
