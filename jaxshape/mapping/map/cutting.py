@@ -33,17 +33,24 @@ FURTHER = 0.03
 """Metres outside of the box from which points count: noise goes that far."""
 
 
-def parts_in(prepared: PreparedFrame, core: Bool[np.ndarray, "H W"] | None = None) -> Parts:
+def parts_in(
+    prepared: PreparedFrame,
+    core: Bool[np.ndarray, "H W"] | None = None,
+    *,
+    with_tables: bool = True,
+) -> Parts:
     """The parts of a frame at working size.
 
     Args:
         prepared: The frame.
         core: Pixels that surely show the object, in full size `[H W]`; None for none.
+        with_tables: Whether table tops are background; False where tables are objects.
     """
     fx, fy, cx, cy = (float(x) for x in prepared.view.intrinsics)
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     depth = np.asarray(prepared.view.depth)
-    return parts_of(depth, K, None if core is None else np.asarray(resized(core, depth.shape)))
+    sure = None if core is None else np.asarray(resized(core, depth.shape))
+    return parts_of(depth, K, sure, with_tables=with_tables)
 
 
 def cut_new(

@@ -4,6 +4,8 @@ localize    registration from the expected pose; where that fails, from many oth
 has_moved   whether a frame shows the object from elsewhere than the last keyframe
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -23,12 +25,13 @@ _JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess
 
 
 def localize(
-    state: MapState, prepared: PreparedFrame, config: TrackingConfig
+    states: Sequence[MapState], prepared: PreparedFrame, config: TrackingConfig
 ) -> tuple[Alignment, str | None]:
     """The pose of a frame in the world, and a reason against it.
 
     Args:
-        state: The map; the frame is expected where the motion of the last frames goes on.
+        states: Maps of one or more objects with the same keyframes; the frame is expected where the
+            motion of the last frames goes on.
         prepared: The frame.
         config: Settings of tracking.
 
@@ -36,35 +39,49 @@ def localize(
         The alignment of the frame with the map; and a few words against it, None where there are
         none.
     """
+    state = states[0]
     T_expected = (state.T_world_camera @ state.T_before_last).normalize()
-    pixels = _tracked_pixels(state, prepared, T_expected, config)
-    surface = state.surface if config.against == "map" else no_surface(state.place.lattice)
+    pixels = _tracked_pixels(states, prepared, T_expected, config)
+    surfaces = _surfaces(states, config)
     T_keyframe = state.keyframes[-1].T_world_camera
-    found = _register(prepared.view, pixels, state.view, T_keyframe, surface, T_expected)
+    found = _register(prepared.view, pixels, state.view, T_keyframe, surfaces, T_expected)
     reason = doubt(found, T_expected, config)
     is_sure = found.converged and found.inlier_fraction >= config.sure_inliers
     if reason is None and is_sure:
         return found, None
-    best, is_believed = _relocalized(state, prepared.view, pixels, surface, found, config)
+    best, is_believed = _relocalized(state, prepared.view, pixels, surfaces, found, config)
     if is_believed:
         return best, None
     return best, reason or doubt(best, T_expected, config)
 
 
+def _surfaces(states: Sequence[MapState], config: TrackingConfig) -> tuple[Surface, ...]:
+    """The surfaces that a frame is aligned with, a power of two of them: some may be empty."""
+    nothing = no_surface(states[0].place.lattice)
+    if config.against == "keyframe":
+        return (nothing,)
+    count = 1 << (len(states) - 1).bit_length()
+    return (*(one.surface for one in states), *[nothing] * (count - len(states)))
+
+
 def _tracked_pixels(
-    state: MapState, prepared: PreparedFrame, T_expected: jaxlie.SE3, config: TrackingConfig
+    states: Sequence[MapState],
+    prepared: PreparedFrame,
+    T_expected: jaxlie.SE3,
+    config: TrackingConfig,
 ) -> Bool[Array, "h w"]:
-    """Pixels that are aligned: all, or those of the object."""
+    """Pixels that are aligned: all, or those of the objects."""
     if config.on == "scene":
         return jnp.ones_like(prepared.masked)
-    return object_pixels(prepared, state.place, T_expected)
+    found = [object_pixels(prepared, one.place, T_expected) for one in states]
+    return jnp.any(jnp.stack(found), axis=0)
 
 
 def _relocalized(
     state: MapState,
     view: DepthView,
     pixels: Bool[Array, "h w"],
-    surface: Surface,
+    surfaces: tuple[Surface, ...],
     found: Alignment,
     config: TrackingConfig,
 ) -> tuple[Alignment, bool]:
@@ -79,7 +96,7 @@ def _relocalized(
         is_last = keyframe is state.keyframes[-1]
         T_near = state.T_world_camera if is_last else keyframe.T_world_camera
         again = _register_from(
-            view, pixels, reference, keyframe.T_world_camera, surface, T_near, center
+            view, pixels, reference, keyframe.T_world_camera, surfaces, T_near, center
         )
         if registration.score(again) > registration.score(best):
             best = again
@@ -94,15 +111,20 @@ def _worth_trying(keyframes: tuple[Keyframe, ...], count: int = 4) -> list[Keyfr
     return [keyframes[-1], *(keyframes[i] for i in others if 0 <= i < len(keyframes) - 1)]
 
 
+def _match(reference, T_reference, surfaces):
+    of_map = map(surfels.match_surface, surfaces)
+    return icp.match_all(icp.match_view(reference, T_reference), *of_map)
+
+
 @jax.jit
-def _register(view, pixels, reference, T_reference, surface, T_expected):
-    match = icp.match_all(icp.match_view(reference, T_reference), surfels.match_surface(surface))
+def _register(view, pixels, reference, T_reference, surfaces, T_expected):
+    match = _match(reference, T_reference, surfaces)
     return registration.register(view, pixels, match, T_expected)
 
 
 @jax.jit
-def _register_from(view, pixels, reference, T_reference, surface, T_near, center):
-    match = icp.match_all(icp.match_view(reference, T_reference), surfels.match_surface(surface))
+def _register_from(view, pixels, reference, T_reference, surfaces, T_near, center):
+    match = _match(reference, T_reference, surfaces)
     return registration.register_from(view, pixels, match, registration.guesses(T_near, center))
 
 

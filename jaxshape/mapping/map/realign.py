@@ -1,5 +1,7 @@
 """Realign all keyframes with the map (paper, section 3.4), in one joint least-squares problem.
 
+The sums go over all objects of the map, each with a grid of its own.
+
 In every cell of the map's grid, the patches that the keyframes see there should lie on one plane.
 Where that plane lies is eliminated, so that the unknowns are the poses alone: moving one keyframe
 moves what the others are compared with, and a loop closes in a few steps instead of being carried
@@ -79,11 +81,12 @@ def realign(
     """The poses of the keyframes that agree best with each other, the shape and the odometry.
 
     Args:
-        clouds: Oriented points of each keyframe, in its camera's frame, padded to one number.
+        clouds: Oriented points that each keyframe shows of each object `[object k ...]`, in its
+            camera's frame, padded to one number.
         T_world_camera: Poses of the keyframes before `[k]`.
         is_keyframe: False for padding `[k]`.
-        lattice: Cells in which keyframes are compared.
-        predicted: Surface of the refined shape.
+        lattice: Cells of each object `[object ...]`, in which keyframes are compared.
+        predicted: Surface of the refined shape of each object `[object ...]`.
         odometry: Tracked poses between neighbouring keyframes.
         is_fixed: True for keyframes that keep their poses `[k]`; without one, the whole map may
             drift.
@@ -94,9 +97,15 @@ def realign(
     moves = is_keyframe & ~is_fixed
 
     def improve(i, T):
-        observed = _observe(clouds, T, is_keyframe, lattice)
         tolerance = _ROUGH * 0.5**i
-        H, g = _surface_equations(observed, predicted, tolerance)
+
+        def of_object(clouds, lattice, predicted):
+            observed = _observe(clouds, T, is_keyframe, lattice)
+            return _surface_equations(observed, predicted, tolerance)
+
+        H, g = jax.tree.map(
+            lambda x: x.sum(axis=0), jax.vmap(of_object)(clouds, lattice, predicted)
+        )
         odometry_H, odometry_g = _odometry_equations(T, odometry)
         step = _solve(H + odometry_H, g + odometry_g, moves)
         return _moved(T, step)

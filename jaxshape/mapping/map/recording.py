@@ -9,7 +9,7 @@ Whatever is wrong with one frame, a damaged file or a pose in doubt, costs that 
 written down in its `FrameLog`.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.mapping.map.cutting import cut_all, cut_new, is_outgrown, parts_in
-from jaxshape.mapping.map.mapper import Mapper, Step
+from jaxshape.mapping.map.mapper import Mapper
+from jaxshape.mapping.map.several import Member, Parts, Step, step_all
 from jaxshape.mapping.map.state import MapState
 from jaxshape.mapping.placement.finding import (
     Start,
@@ -28,7 +29,7 @@ from jaxshape.mapping.placement.finding import (
     room,
     with_room,
 )  # fmt: skip
-from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare
+from jaxshape.mapping.tracking.keyframes import Cut, Keyframe, PreparedFrame, as_pose, prepare
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.reconstruction import Reconstruction
 
@@ -119,7 +120,8 @@ def follow(
         yield progress
     done = progress.logs[-1].index
     for index in (i for i in chosen if i > done):
-        progress = _next(sequence, index, mapper, progress, use_poses)
+        followed = [Followed(progress, mapper.parts)]
+        (progress,) = advance(sequence, index, followed, use_poses, _belonging)
         if progress.logs[-1].status == "keyframe":
             progress = _placed_anew(progress, mapper, prior)
         yield progress
@@ -137,44 +139,101 @@ def _begin(sequence: Sequence, start: Start, mapper: Mapper, use_poses: bool) ->
         room=room(start),
         poses_are_given=use_poses,
     )
-    log = FrameLog(start.index, frame.name, "keyframe", "", 0, np.eye(4), _figures(step))
+    log = FrameLog(start.index, frame.name, "keyframe", "", 0, np.eye(4), as_figures(step))
     return Progress(state, start, (log,), step.shape)
 
 
-def _next(
-    sequence: Sequence, index: int, mapper: Mapper, progress: Progress, use_poses: bool
-) -> Progress:
-    state, logs = progress.state, progress.logs
-    last = len(state.keyframes) - 1
+class Followed(NamedTuple):
+    """An object that is followed with others.
+
+    Attributes:
+        progress: Its map and its place; its logs are those of all.
+        parts: Prior and settings of its class.
+        is_fused: Whether new keyframes are fused into it.
+    """
+
+    progress: Progress
+    parts: Parts
+    is_fused: bool = True
+
+
+Recut = Callable[[PreparedFrame, Progress], Cut | None]
+"""From a new frame and the progress of an object to what cuts the object out of the frame."""
+
+
+def advance(
+    sequence: Sequence, index: int, followed: Iterable[Followed], use_poses: bool, recut: Recut
+) -> list[Progress]:
+    """The progress of all objects after one more frame.
+
+    Args:
+        sequence: The recording.
+        index: Number of the frame, from 0.
+        followed: The objects, one or more, whose maps hold the same keyframes.
+        use_poses: Whether the given poses are used.
+        recut: How each object is cut out of a new keyframe.
+    """
+    followed = list(followed)
+    before = [one.progress for one in followed]
+    logs, last = before[0].logs, len(before[0].state.keyframes) - 1
     try:
         frame = sequence[index]
     except SequenceError as problem:
         name = sequence.names[index]
         log = FrameLog(index, name, "unreadable", str(problem), last, None, {})
-        return progress._replace(logs=(*logs, log))
+        return [one._replace(logs=(*logs, log)) for one in before]
     given = frame.T_world_camera if use_poses else None
     prepared = prepare(frame)
-    # A mask, or a box that was given, says what is the object; one that was found is not sure.
-    is_estimated = progress.start.T_level_world is not None and frame.mask is None
-    cut = partial(cut_new, prepared, state.keyframes, state.place.cut) if is_estimated else None
-    state, step = mapper.step(state, prepared, None if given is None else as_pose(given), cut)
+    members = [
+        Member(
+            one.parts,
+            one.progress.state,
+            recut(prepared, one.progress) if frame.mask is None else None,
+            one.is_fused,
+        )
+        for one in followed
+    ]
+    states, step, shapes = step_all(members, prepared, None if given is None else as_pose(given))
+    logs = (*logs, _log(index, frame.name, states[0], step))
+    return [
+        Progress(state, one.start, logs, shape or one.shape)
+        for one, state, shape in zip(before, states, shapes, strict=True)
+    ]
+
+
+def _log(index: int, name: str, state: MapState, step: Step) -> FrameLog:
+    """The outcome of a frame that could be read."""
     relative = None
     if step.T_world_camera is not None:
         keyframe = state.keyframes[-1].T_world_camera
         relative = np.asarray((keyframe.inverse() @ step.T_world_camera).as_matrix(), np.float64)
-    log = FrameLog(
+    return FrameLog(
         index=index,
-        name=frame.name,
+        name=name,
         status=step.status,
         reason=step.reason,
         keyframe=len(state.keyframes) - 1,
         T_keyframe_camera=relative,
-        figures=_figures(step),
+        figures=as_figures(step),
     )
-    return Progress(state, progress.start, (*logs, log), step.shape or progress.shape)
 
 
-def _figures(step: Step) -> dict[str, float]:
+def _belonging(prepared: PreparedFrame, progress: Progress) -> Cut | None:
+    """How one object alone is cut out: by its box, and by the parts that belong to it.
+
+    A box that was given says what is the object; one that was found is not sure.
+    """
+    if progress.start.T_level_world is None:
+        return None
+    return partial(cut_new, prepared, progress.state.keyframes, progress.state.place.cut)
+
+
+def as_figures(step: Step) -> dict[str, float]:
+    """Agreement and seconds of a step, as a `FrameLog` holds them.
+
+    Args:
+        step: Outcome of the frame.
+    """
     figures = {f"seconds_{part}": seconds for part, seconds in step.seconds.items()}
     if step.alignment is not None:
         for name in ("inlier_fraction", "overlap", "rmse", "conditioning"):

@@ -1,5 +1,6 @@
 """The state of a map: keyframes, what they add up to, and the shape that explains it. [host]"""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -178,43 +179,87 @@ def odometry_of(
     return (T_last.inverse() @ T).normalize(), information
 
 
-def realigned(state: MapState) -> MapState:
-    """The state with all keyframes moved to where they agree with each other and with the shape.
+def carried(state: MapState, keyframe: Keyframe, view: DepthView) -> MapState:
+    """The state with one more keyframe that is not fused.
 
     Args:
-        state: A map of at least one keyframe, with its shape refined.
+        state: The map.
+        keyframe: The keyframe.
+        view: Its view.
+    """
+    return state._replace(keyframes=(*state.keyframes, keyframe), view=view)
+
+
+def realigned(states: Sequence[MapState], is_fused: Sequence[bool]) -> list[MapState]:
+    """The maps with all keyframes moved to where they agree with each other and with the shapes.
+
+    Args:
+        states: Maps of one or more objects with the same keyframes, with their shapes refined.
+        is_fused: Whether the keyframes are fused into each; others only keep their poses.
 
     Returns:
-        The map with new poses, fused anew; the last tracked frame moves with the last keyframe.
+        The maps with new poses, fused anew; the last tracked frame moves with the last keyframe.
     """
-    T = realigned_poses(state)
+    fused = [state for state, chosen in zip(states, is_fused, strict=True) if chosen]
+    if not fused:
+        return list(states)
+    T = realigned_poses(fused)
+    anew = [_at_poses(state, T) for state in states]
+    return [
+        with_surface(fused_anew(state)) if chosen else state
+        for state, chosen in zip(anew, is_fused, strict=True)
+    ]
+
+
+def _at_poses(state: MapState, T: list[jaxlie.SE3]) -> MapState:
+    """The state with its keyframes at other poses, not yet fused there."""
     moved = (T[-1] @ state.keyframes[-1].T_world_camera.inverse()).normalize()
     keyframes = tuple(
         one._replace(T_world_camera=pose) for one, pose in zip(state.keyframes, T, strict=True)
     )
-    state = state._replace(
+    return state._replace(
         keyframes=keyframes, T_world_camera=(moved @ state.T_world_camera).normalize()
     )
-    return with_surface(fused_anew(state))
 
 
-def realigned_poses(state: MapState) -> list[jaxlie.SE3]:
-    """Poses at which the keyframes agree best with each other and with the refined shape."""
-    count = len(state.keyframes)
+def realigned_poses(states: Sequence[MapState]) -> list[jaxlie.SE3]:
+    """Poses at which the keyframes agree best with each other and with the refined shapes."""
+    shared = states[0].keyframes
+    count = len(shared)
     capacity = capacity_for(count)
-    filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - count)]
-    clouds, T, T_previous, information = jax.tree.map(
-        lambda *x: jnp.stack(x),
-        *[(k.cloud, k.T_world_camera, k.T_previous_keyframe, k.information) for k in filled],
+    filled = [*shared, *[shared[-1]] * (capacity - count)]
+    T, T_previous, information = _stacked(
+        [(k.T_world_camera, k.T_previous_keyframe, k.information) for k in filled]
     )
     is_keyframe = np.arange(capacity) < count
     information = jnp.where(jnp.asarray(is_keyframe)[:, None, None], information, 0)
-    center = jnp.float32(state.place.box.T_world_object[:3, 3])
+    seen = [_seen_by(state, capacity) for state in states]
+    # The number of objects is a power of two, too: the others have no points and no shape.
+    rows = 1 << (len(seen) - 1).bit_length()
+    clouds, lattice, probability = _stacked([*seen, *[_unseen(seen[0])] * (rows - len(seen))])
+    center = jnp.float32(states[0].place.box.T_world_object[:3, 3])
     T = _realign(
-        clouds, T, is_keyframe, state.place.lattice, jax.nn.sigmoid(state.logits),
+        clouds, T, is_keyframe, lattice, probability,
         Odometry(T_previous, information), np.arange(capacity) == 0, center,
     )  # fmt: skip
     return [jaxlie.SE3(T.wxyz_xyz[i]) for i in range(count)]
+
+
+def _seen_by(state: MapState, capacity: int) -> tuple[Any, Lattice, Array]:
+    """What aligns the keyframes of one object: their clouds, its lattice and its shape."""
+    filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - len(state.keyframes))]
+    clouds = _stacked([one.cloud for one in filled])
+    return clouds, state.place.lattice, jax.nn.sigmoid(state.logits)
+
+
+def _unseen(seen: tuple[Any, Lattice, Array]) -> tuple[Any, Lattice, Array]:
+    clouds, lattice, probability = seen
+    nowhere = jnp.full_like(clouds.deviation, jnp.inf)
+    return clouds._replace(deviation=nowhere), lattice, jnp.zeros_like(probability)
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
 def capacity_for(count: int) -> int:
@@ -235,7 +280,7 @@ def _realign(clouds, T, is_keyframe, lattice, probability, odometry, is_fixed, c
     # About the object, so that rotations have short arms and positions keep their digits.
     near = Lattice(lattice.linear, lattice.offset + lattice.linear @ center)
     to_near = jaxlie.SE3.from_translation(-center)
-    predicted = surfels.predicted_surface(near, probability)
+    predicted = jax.vmap(surfels.predicted_surface)(near, probability)
     T = realign(clouds, to_near @ T, is_keyframe, near, predicted, odometry, is_fixed)
     return to_near.inverse() @ T
 

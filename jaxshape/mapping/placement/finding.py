@@ -26,7 +26,7 @@ from jaxshape.mapping.placement.faces import (
     object_points,
     tallest,
 )  # fmt: skip
-from jaxshape.mapping.placement.placing import Placement, turn
+from jaxshape.mapping.placement.placing import Placement, PlacementConfig, turn
 from jaxshape.mapping.placement.rays import pooled, sample_rays
 from jaxshape.mapping.segmentation.planes import (
     Floor,
@@ -55,6 +55,7 @@ FIRST_FRAMES = 10
 _NEARLY_LEVEL = np.cos(np.radians(50))  # people tilt cameras down to look at things, by so much
 _FLOOR_MARGIN = 0.02  # metres above the floor below which nothing counts as the object
 _STEP = 0.04  # metres by which two floors differ that are not the same
+_USUAL = PlacementConfig()
 _ROOM = 0.15  # by which a box that was estimated is enlarged before the object is cut out with it
 
 
@@ -208,7 +209,7 @@ def _place_first(
     is_doubtful = floor is None or floor.confidence < SURE
     doubts = [cut] * (found.confidence < SURE) + [of_up] * is_doubtful
     T_level_world = np.eye(4)
-    T_level_world[:3, :3] = _rotation_onto_y(up)
+    T_level_world[:3, :3] = rotation_onto_y(up)
     prepared = prepare(frame)
     start = Start(
         index=index,
@@ -283,8 +284,12 @@ def _floor_height(floor: Floor | None, T_level_camera: Float[np.ndarray, "4 4"])
     return float((T_level_camera[:3, :3] @ on_floor + T_level_camera[:3, 3])[1])
 
 
-def _rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation that takes `up` to +y, and turns as little else as it can."""
+def rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation that takes a direction to +y, and turns as little else as it can.
+
+    Args:
+        up: The direction `[3]`, of any length.
+    """
     y = up / np.linalg.norm(up)
     sideways = np.eye(3)[np.argmin(np.abs(y))]
     x = np.eye(3)[0] if abs(y[0]) < 0.9 else sideways
@@ -311,7 +316,7 @@ def on_the_floor(start: Start, keyframes: tuple[Keyframe, ...]) -> Start:
     """
     assert start.T_level_world is not None
     points = object_points(cutouts(keyframes))
-    floors = [_floor_of(one, points) for one in keyframes if one.parts is not None]
+    floors = [floor_of(one, points) for one in keyframes if one.parts is not None]
     sure = [one for one in floors if one.confidence >= SURE]
     if not sure:
         return start
@@ -329,8 +334,13 @@ def _height_at(floor: Plane, start: Start) -> float:
     return float((start.T_level_world[:3, :3] @ below + start.T_level_world[:3, 3])[1])
 
 
-def _floor_of(keyframe: Keyframe, points: Float[np.ndarray, "n 3"]) -> Floor:
-    """The floor of a keyframe in the world, and how sure it is that the object stands on it."""
+def floor_of(keyframe: Keyframe, points: Float[np.ndarray, "n 3"]) -> Floor:
+    """The floor of a keyframe in the world, and how sure it is that the object stands on it.
+
+    Args:
+        keyframe: The keyframe, with its parts.
+        points: Points of the object in the world `[n 3]`, in metres.
+    """
     assert keyframe.parts is not None
     T = np.asarray(keyframe.T_world_camera.as_matrix(), np.float64)
     normal = T[:3, :3] @ keyframe.parts.floor[:3]
@@ -348,7 +358,7 @@ def _standing_on(start: Start, floor: Plane) -> Start:
     """The start in a level frame whose up is the normal of a floor, with the box standing on it."""
     assert start.T_level_world is not None
     T_level_world = np.eye(4)
-    T_level_world[:3, :3] = _rotation_onto_y(np.asarray(floor.normal, np.float64))
+    T_level_world[:3, :3] = rotation_onto_y(np.asarray(floor.normal, np.float64))
     T_level_object = T_level_world @ start.box.T_world_object
     front = T_level_object[:3, 2]
     T_level_object[:3, :3] = np.asarray(turn(jnp.arctan2(front[0], front[2])), np.float64)
@@ -364,7 +374,7 @@ def _standing_on(start: Start, floor: Plane) -> Start:
         notes=tuple(dict.fromkeys((*start.notes, said))),
         warnings=kept,
     )
-    return _in_box(start, _without_floor(between(box, lower, upper), height))
+    return _in_box(start, without_floor(between(box, lower, upper), height))
 
 
 # A face that is seen later -----------------------------------------------------------------------
@@ -389,12 +399,29 @@ def refitted(start: Start, keyframes: tuple[Keyframe, ...]) -> Start:
 # Placement --------------------------------------------------------------------------------------
 
 
-def placed_again(start: Start, prior: ShapePrior, keyframes: tuple[Keyframe, ...]) -> Start:
-    """The start with its box estimated from all keyframes, beginning at its earlier placement."""
-    return _placed(start, prior, cutouts(keyframes))
+def placed_again(
+    start: Start,
+    prior: ShapePrior,
+    keyframes: tuple[Keyframe, ...],
+    config: PlacementConfig = _USUAL,
+) -> Start:
+    """The start with its box estimated from all keyframes, beginning at its earlier placement.
+
+    Args:
+        start: The object, with its latest box.
+        prior: The shape prior of its class.
+        keyframes: The keyframes of the map.
+        config: Settings of the placement: sizes of the class, and how long it is sought.
+    """
+    return _placed(start, prior, cutouts(keyframes), config)
 
 
-def _placed(start: Start, prior: ShapePrior, frames: list[Cutout]) -> Start:
+def _placed(
+    start: Start,
+    prior: ShapePrior,
+    frames: list[Cutout],
+    config: PlacementConfig = _USUAL,
+) -> Start:
     """The start with the box that the prior finds; as it is where nothing can be placed.
 
     Its faces lie where the object was seen to end.
@@ -407,12 +434,12 @@ def _placed(start: Start, prior: ShapePrior, frames: list[Cutout]) -> Start:
     ]
     poses = [as_pose(start.T_level_world @ one.T_world_camera) for one in frames]
     seen = _pooled(_stacked(each), _stacked(poses))
-    found = _place(prior, seen, jnp.float32(start.floor), known)
+    found = _place(prior, seen, jnp.float32(start.floor), known, config)
     if not np.isfinite(found.misfit):
         return start
     T_level_object = np.asarray(found.T_world_object.as_matrix(), np.float64)
     box = Box(np.linalg.inv(start.T_level_world) @ T_level_object, np.asarray(found.size, float))
-    box = _without_floor(box, start.floor)
+    box = without_floor(box, start.floor)
     return _in_box(start._replace(placement=found), fitted(box, faces_of(box, frames)))
 
 
@@ -430,11 +457,16 @@ def _stacked(trees: list[Any]) -> Any:
 
 _sample_rays = jax.jit(sample_rays)
 _pooled = jax.jit(pooled)
-_place = jax.jit(placing.place)
+_place = jax.jit(placing.place, static_argnums=4)
 
 
-def _without_floor(box: Box, floor: float) -> Box:
-    """The box, with what lies on the floor excluded."""
+def without_floor(box: Box, floor: float) -> Box:
+    """The box, with what lies on the floor excluded.
+
+    Args:
+        box: The box.
+        floor: Height of the floor in the level frame, in metres; NaN where it is not known.
+    """
     if not np.isfinite(floor):
         return box
     bottom = -box.size[1] / 2

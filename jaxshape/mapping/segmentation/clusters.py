@@ -130,8 +130,14 @@ def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> 
 # Background -----------------------------------------------------------------------------------
 
 
-def background(view: Scene, click: Pixel | None) -> Image:
-    """True on and behind floor and walls, and on table tops, unless they were clicked on."""
+def background(view: Scene, click: Pixel | None, *, with_tables: bool = True) -> Image:
+    """True on and behind floor and walls, and on table tops, unless they were clicked on.
+
+    Args:
+        view: The reduced frame.
+        click: Row and column of a pixel that shows the object; None for none.
+        with_tables: Whether table tops are background; False where tables are objects.
+    """
     floor = None if view.floor is None else view.floor.plane
     found = np.zeros(view.z.shape, bool) if floor is None else _beyond(view, floor)
     for plane in view.planes:
@@ -144,7 +150,8 @@ def background(view: Scene, click: Pixel | None) -> Image:
         sides = [_shorter_side(view.points[part]) for part in parts]
         if _is_wall(plane, parts, sides, view):
             found |= _beyond(view, plane)
-        limit = TABLE if floor is not None and _is_table_top(plane, floor) else SHEET
+        is_table = with_tables and floor is not None and _is_table_top(plane, floor)
+        limit = TABLE if is_table else SHEET
         for part, side in zip(parts, sides, strict=True):
             found |= part & (side > limit)
     return found

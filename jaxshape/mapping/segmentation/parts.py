@@ -43,6 +43,8 @@ def parts_of(
     depth: Float[np.ndarray, "h w"],
     K: Float[np.ndarray, "3 3"],
     sure: Bool[np.ndarray, "h w"] | None = None,
+    *,
+    with_tables: bool = True,
 ) -> Parts:
     """The parts of a frame.
 
@@ -50,12 +52,13 @@ def parts_of(
         depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
         K: Camera matrix `[3 3]`, in pixels.
         sure: Pixels that are known to show the object `[h w]`; None for none.
+        with_tables: Whether table tops are background; False where tables are objects.
 
     Returns:
         The clusters, and the floor with its evidence.
     """
     view = look(depth, K, stride=1)
-    free = np.isfinite(view.z) & ~background(view, None)
+    free = np.isfinite(view.z) & ~background(view, None, with_tables=with_tables)
     labels = clusters(view, free)
     at_border = np.array(corners(labels, view), int)
     labels[free & (labels == 0)] = SPECK

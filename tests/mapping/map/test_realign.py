@@ -37,7 +37,15 @@ def keyframes(noise, count=COUNT):
 
 
 NO_SHAPE = jax.jit(surfels.predicted_surface)(LATTICE, jnp.zeros((32, 32, 32)))
-run = jax.jit(realign.realign)
+
+
+@jax.jit
+def run(clouds, T, is_keyframe, lattice, predicted, odometry, is_fixed):
+    """Of a single object."""
+    clouds, lattice, predicted = jax.tree.map(lambda x: x[None], (clouds, lattice, predicted))
+    return realign.realign(clouds, T, is_keyframe, lattice, predicted, odometry, is_fixed)
+
+
 FIRST_FIXED = jnp.arange(COUNT) == 0
 ALL = jnp.ones(COUNT, bool)
 

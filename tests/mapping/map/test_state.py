@@ -43,7 +43,7 @@ def test_a_map_of_more_than_512_keyframes_is_realigned(monkeypatch, linear_prior
     poses = np.float32([[1, 0, 0, 0, 0.01 * i, 0, 0] for i in range(513)])
     keyframes = tuple(first._replace(T_world_camera=jaxlie.SE3(pose)) for pose in poses)
     few = assemble(linear_prior, place, (first,), prepared.view, MappingConfig())
-    found = realigned_poses(few._replace(keyframes=keyframes))
+    found = realigned_poses([few._replace(keyframes=keyframes)])
     np.testing.assert_array_equal([T.wxyz_xyz for T in found], poses)
     ((is_keyframe, is_fixed, information),) = asked
     assert len(is_keyframe) == 1024 and is_keyframe[:513].all() and not is_keyframe[513:].any()

@@ -1,0 +1,1 @@
+"""Scenes: several objects of several classes, found, told apart and kept apart as frames come."""

@@ -1,0 +1,215 @@
+"""The classes that objects of a scene may be of, and how one is decided. [host]
+
+Each class has a prior. An object is of the class whose prior predicts hidden parts of it clearly
+better than anything else does that is not made for it: the priors of other classes, and its own
+prior with the front turned away. A plant is predicted alike from all sides, badly; a cube alike
+from all sides, well; a chair well from its front alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxshape.geometry.grids import Grids, binary
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.map.mapper import Mapper, build_mapper
+from jaxshape.mapping.placement.placing import PlacementConfig
+from jaxshape.mapping.scene.evidence import Predicted, predict_hidden
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.search.config import RefineConfig
+from jaxshape.search.reconstruction import Reconstruction, refiner_for, usual_method
+
+NOTHING = -20.0
+"""Logit of shapes that are not filled."""
+
+
+class SceneClass(NamedTuple):
+    """A class of objects.
+
+    Attributes:
+        name: Its name, such as "chair".
+        prior: The prior that decides the class, and rebuilds.
+        placer: The prior that finds boxes of its objects.
+        mapper: Tracking and mapping with that prior.
+        sizes: Usual sizes of its objects, and how long boxes are sought.
+    """
+
+    name: str
+    prior: ShapePrior
+    placer: ShapePrior
+    mapper: Mapper
+    sizes: PlacementConfig
+
+
+class SceneClasses(NamedTuple):
+    """All classes of a scene.
+
+    Attributes:
+        known: The classes, in the order in which they go through the decoder.
+        unknown: Mapping of objects whose class is not decided, or that are of none: nothing is
+            searched.
+    """
+
+    known: tuple[SceneClass, ...]
+    unknown: Mapper
+
+    def named(self, name: str | None) -> SceneClass | None:
+        """The class of a name.
+
+        Args:
+            name: The name; None for no class.
+        """
+        return next((one for one in self.known if one.name == name), None)
+
+
+class Decision(NamedTuple):
+    """What an object is.
+
+    Attributes:
+        name: Name of its class; None for none of them.
+        quarters: Quarters of a turn by which its front is turned from that of its box.
+        sure: Probability of the answer, from 0 to 1.
+        scores: Evidence for each class, in nats per hidden surface voxel over the best rival.
+    """
+
+    name: str | None
+    quarters: int
+    sure: float
+    scores: dict[str, float]
+
+
+SIZES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "chair": ((0.58, 0.86, 0.60), (0.34, 0.21, 0.29)),
+    "table": ((1.05, 0.68, 0.72), (0.50, 0.25, 0.42)),
+}
+"""Geometric means of the extents of procedural objects along x, y and z, in metres, and the
+standard deviations of their logarithms."""
+
+
+_SEARCH, _MAPPING, _TRACKING = RefineConfig(), MappingConfig(), TrackingConfig()
+
+
+def sizes_of(name: str) -> PlacementConfig:
+    """Usual sizes of a class, for a short search of the box: a box is known beforehand.
+
+    Args:
+        name: Name of the class; one whose sizes are not known may be of any.
+    """
+    typical, spread = SIZES.get(name, ((0.6, 0.6, 0.6), (0.7, 0.7, 0.7)))
+    return PlacementConfig(
+        typical, spread, yaws=12, overhangs=(0.0, 0.3), kept=3, steps=30, steps_again=30
+    )
+
+
+def build_classes(
+    priors: Mapping[str, ShapePrior],
+    *,
+    placers: Mapping[str, ShapePrior] | None = None,
+    method: str | None = None,
+    search: RefineConfig = _SEARCH,
+    mapping: MappingConfig = _MAPPING,
+    track: TrackingConfig = _TRACKING,
+    seed: int = 0,
+) -> SceneClasses:
+    """The classes of a scene, one for each prior. [host]
+
+    Args:
+        priors: The prior of each class, by the name of the class; one or more.
+        placers: Priors that find boxes, by the name of the class; None, and classes that are not
+            named, take the priors themselves.
+        method: How codes are searched (`refiner_for`); None for the usual way of each prior.
+        search: Settings of the search.
+        mapping: When a frame becomes a keyframe, and how keyframes are fused.
+        track: How the pose of a frame is found, and when it is believed.
+        seed: Seed of the random numbers of the search, 0 or more.
+
+    Raises:
+        ValueError: There is no prior, or their grids differ in resolution.
+    """
+    if not priors:
+        raise ValueError("There are no priors; give one for each class: {'chair': load_prior()}.")
+    sides = {name: prior.resolution for name, prior in priors.items()}
+    if len(set(sides.values())) > 1:
+        raise ValueError(f"The priors have grids of different sides, {sides}; give them one side.")
+    known = []
+    for name, prior in priors.items():
+        refiner = refiner_for(method or usual_method(prior), prior, search)
+        mapper = build_mapper(prior, refiner, search, mapping, track, seed=seed)
+        placer = (placers or {}).get(name, prior)
+        known.append(SceneClass(name, prior, placer, mapper, sizes_of(name)))
+    first = next(iter(priors.values()))
+    unknown = build_mapper(first, None, search, mapping, track, seed=seed, is_searched=False)
+    return SceneClasses(tuple(known), unknown)
+
+
+# Decisions -------------------------------------------------------------------------------------
+
+MARGIN, SPREAD = 0.2, 0.06
+"""Nats per hidden surface voxel by which a class must beat its rivals, and the width over which the
+answer goes from unlikely to likely."""
+
+WORST = -1.45
+"""Log-likelihood of hidden surface voxels below which no class predicts an object."""
+
+
+def decide(classes: Sequence[SceneClass], grids: Grids) -> list[Decision]:
+    """The class and the front of each object; all objects go through one call for each class.
+
+    Args:
+        classes: The classes, one or more.
+        grids: F and M of each object `[object x y z]`, in boxes with any front.
+    """
+    count = len(grids.occupied)
+    rows = jnp.minimum(jnp.arange(1 << (count - 1).bit_length()), count - 1)
+    padded = Grids(grids.occupied[rows], grids.occluded[rows])
+    found = {one.name: predict_hidden(one.prior, padded) for one in classes}
+    return [
+        decided({name: Predicted(*(np.asarray(x)[i] for x in of)) for name, of in found.items()})
+        for i in range(count)
+    ]
+
+
+def decided(found: Mapping[str, Predicted]) -> Decision:
+    """The class and the front of one object, from what each prior predicts.
+
+    Args:
+        found: Scores `[turn]` of each class.
+    """
+    total = {name: np.asarray(one.surface) for name, one in found.items()}
+    margins, fronts = {}, {}
+    for name, own in total.items():
+        fronts[name] = int(own.argmax())
+        rivals = [other.max() for rival, other in total.items() if rival != name]
+        margins[name] = float(own.max() - max([np.delete(own, fronts[name]).max(), *rivals]))
+    best = max(margins, key=lambda name: margins[name])
+    likely = _sigmoid((margins[best] - MARGIN) / SPREAD)
+    if total[best].max() < WORST:
+        likely = min(likely, 0.1)
+    scores = {name: round(margin, 3) for name, margin in margins.items()}
+    if likely > 0.5:
+        return Decision(best, fronts[best], likely, scores)
+    return Decision(None, 0, 1 - likely, scores)
+
+
+def _sigmoid(x: float) -> float:
+    return float(1 / (1 + np.exp(-x)))
+
+
+def unfilled(grids: Grids, code: Float[Array, " d"]) -> Reconstruction:
+    """The shape of an object of no class: what was measured, and nothing else.
+
+    Args:
+        grids: Its F and M `[x y z]`.
+        code: Any code `[d]`, which stands for none.
+    """
+    measured = jnp.asarray(binary(grids).occupied)[None]
+    nothing = jnp.full(measured.shape, NOTHING)
+    empty = jnp.zeros_like(measured)
+    unknown = jnp.full(1, jnp.nan)
+    return Reconstruction(
+        code[None], code[None], empty, nothing, empty, measured, nothing, None, None,
+        unknown, unknown, None, None, None, None,
+    )  # fmt: skip

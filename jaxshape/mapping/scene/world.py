@@ -1,0 +1,307 @@
+"""What stands in a room, from all keyframes at once: cells of space, and their clusters. [host]
+
+One frame cuts things apart that belong together and joins things that only look close. So the
+points of all keyframes are put into cells of a grid of the world; a cell that frames saw through
+more often than they met something in it is dropped; what is left falls into clusters. As frames
+come, clusters appear, join and part by themselves.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from jaxshape.mapping.placement.faces import Cutout, world_points
+
+CELL = 0.03
+"""Edge length of a cell, in metres: things closer than that are one cluster."""
+
+FLOOR_MARGIN = 0.025
+"""Metres above the floor below which nothing is a thing, on top of the noise of depth."""
+
+THROUGH = 0.05
+"""Metres behind a cell from which a depth says that the cell is free, on top of its noise."""
+
+NOISE = 4.8e-3
+"""Three standard deviations of depth at 1 m, in metres; they grow with the square of depth."""
+
+TOP_HEIGHT, TOP_AREA, TOP_FILLED = 0.45, 0.16, 0.6
+"""A level slice of a cluster is a table top from this height above the floor, in metres, this area,
+in square metres, and this share of the rectangle around it. Seats are smaller or have a back."""
+
+LEAST_CELLS = 40
+"""Cells of the smallest object."""
+
+LONGEST, TALLEST, LEAST_HEIGHT = 2.6, 2.2, 0.1
+"""Metres: longest side of an object along the floor, and its greatest and least height."""
+
+ABOVE_FLOOR = 0.3
+"""Metres of the lowest cell above the floor from which something has to support it."""
+
+FRAGMENT, COVERED, HIGHER = 0.3, 0.7, 0.45
+"""A cluster is a part of another one if it has at most this share of its cells, this share of its
+footprint lies within that of the other, and the gap between their heights is at most that, in
+metres."""
+
+LOST = 2
+"""Keyframes in a row that saw through a cell, after others met something there, or before."""
+
+CHANGED = 0.3
+"""Share of the cells of a cluster that appeared or vanished from which it was moved."""
+
+
+class Cells(NamedTuple):
+    """Cells of the world in which something was measured.
+
+    Attributes:
+        index: Index of each cell along the axes of the level frame `[n 3]`.
+        hits: Keyframes that met something in it `[n]`.
+        through: Keyframes that saw through it `[n]`.
+        is_changed: True where it was free at first and filled later, or the other way round `[n]`.
+    """
+
+    index: Int[np.ndarray, "n 3"]
+    hits: Int[np.ndarray, " n"]
+    through: Int[np.ndarray, " n"]
+    is_changed: Bool[np.ndarray, " n"]
+
+
+class Cluster(NamedTuple):
+    """Something that stands in the room.
+
+    Attributes:
+        index: Its cells `[n 3]`.
+        is_moved: Whether it came or went while it was filmed.
+        is_on_top: Whether it stands on a table.
+    """
+
+    index: Int[np.ndarray, "n 3"]
+    is_moved: bool
+    is_on_top: bool
+
+
+class Level(NamedTuple):
+    """The level frame of a room.
+
+    Attributes:
+        T_level_world: World to a frame with the same origin and +y up `[4 4]`.
+        floor: Height of the floor in that frame, in metres.
+    """
+
+    T_level_world: Float[np.ndarray, "4 4"]
+    floor: float
+
+
+def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
+    """The cells in which keyframes met something that is neither floor nor wall.
+
+    Args:
+        views: Keyframes in their order, with the pixels that show neither floor nor wall.
+        level: The level frame.
+    """
+    met = [_met(view, level) for view in views]
+    index = np.unique(np.concatenate([np.zeros((0, 3), int), *met]), axis=0)
+    T_world_level = np.linalg.inv(level.T_level_world)
+    centers = (index + 0.5) * CELL @ T_world_level[:3, :3].T + T_world_level[:3, 3]
+    key = keys_of(index)
+    hit = np.array([np.isin(key, keys_of(one)) for one in met]).reshape(len(views), -1)
+    passed = np.array([_seen_through(centers, view) for view in views]).reshape(hit.shape) & ~hit
+    return Cells(index, hit.sum(axis=0), passed.sum(axis=0), _changed(hit, passed))
+
+
+def _met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
+    """Cells that the marked pixels of a view lie in."""
+    marked = np.asarray(view.segmented)
+    points, z = world_points(view)[marked], np.asarray(view.depth, np.float64)[marked]
+    R, t = level.T_level_world[:3, :3], level.T_level_world[:3, 3]
+    points = points @ R.T + t
+    kept = above_floor(points, z, level)
+    return np.unique(np.floor(points[kept] / CELL).astype(int), axis=0)
+
+
+def above_floor(
+    points: Float[np.ndarray, "n 3"], z: Float[np.ndarray, " n"], level: Level
+) -> Bool[np.ndarray, " n"]:
+    """Points that are surely no floor.
+
+    Args:
+        points: Points in the level frame `[n 3]`, in metres.
+        z: Depth at which each was measured `[n]`, in metres.
+        level: The level frame.
+    """
+    return points[:, 1] > level.floor + FLOOR_MARGIN + NOISE / 2 * z**2
+
+
+def keys_of(index: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """One whole number for each cell.
+
+    Args:
+        index: Indices of the cells.
+    """
+    x, y, z = (index + (1 << 20)).astype(np.int64).T
+    return (x << 42) | (y << 21) | z
+
+
+def _seen_through(points: Float[np.ndarray, "n 3"], view: Cutout) -> Bool[np.ndarray, " n"]:
+    """Points in the world that a view clearly sees through, at all pixels around."""
+    T = np.linalg.inv(view.T_world_camera)
+    p = points @ T[:3, :3].T + T[:3, 3]
+    fx, fy, cx, cy = (float(x) for x in view.intrinsics)
+    z = np.maximum(p[:, 2], 1e-6)
+    u, v = np.floor(fx * p[:, 0] / z + cx), np.floor(fy * p[:, 1] / z + cy)
+    depth = np.asarray(view.depth, np.float64)
+    nearest = ndimage.minimum_filter(np.where(depth > 0, depth, 0), 3)
+    h, w = depth.shape
+    inside = (p[:, 2] > 0) & (0 <= u) & (u < w) & (0 <= v) & (v < h)
+    row, column = (np.where(inside, x, 0).astype(int) for x in (v, u))
+    return inside & (nearest[row, column] > z + THROUGH + NOISE * z**2)
+
+
+def _changed(
+    hit: Bool[np.ndarray, "k n"], passed: Bool[np.ndarray, "k n"]
+) -> Bool[np.ndarray, " n"]:
+    """Cells that were all filled and then all free, or the other way round."""
+    if not len(hit):
+        return np.zeros(hit.shape[1], bool)
+    order = np.arange(len(hit))[:, None]
+    first_hit = np.where(hit, order, len(hit)).min(axis=0)
+    last_hit = np.where(hit, order, -1).max(axis=0)
+    after = (passed & (order > last_hit)).sum(axis=0)
+    before = (passed & (order < first_hit)).sum(axis=0)
+    amid = passed.sum(axis=0) - after - before
+    return (amid == 0) & (np.maximum(after, before) >= LOST) & (np.minimum(after, before) == 0)
+
+
+# Clusters --------------------------------------------------------------------------------------
+
+
+def clusters_of(cells: Cells, level: Level) -> list[Cluster]:
+    """Things the size of furniture on the floor or on a table, the largest first.
+
+    Args:
+        cells: Cells in which something was measured.
+        level: The level frame.
+    """
+    kept = (cells.through <= cells.hits) | cells.is_changed
+    floor = level.floor / CELL
+    found = [one for part in _connected(cells.index[kept]) for one in _off_the_table(part, floor)]
+    joined = _joined([one for one, top in found if not top])
+    things = [(one, False) for one in joined] + [(one, True) for one, top in found if top]
+    changed = keys_of(cells.index[cells.is_changed])
+    return sorted(
+        (
+            Cluster(one, bool(np.isin(keys_of(one), changed).mean() > CHANGED), top)
+            for one, top in things
+            if _is_furniture(one) and (top or _stands(one, floor))
+        ),
+        key=lambda cluster: -len(cluster.index),
+    )
+
+
+def _connected(index: Int[np.ndarray, "n 3"]) -> list[Int[np.ndarray, "_ 3"]]:
+    """Cells that touch, even if at a corner only, without specks."""
+    if not len(index):
+        return []
+    low = index.min(axis=0)
+    grid = np.zeros(index.max(axis=0) - low + 1, bool)
+    grid[tuple((index - low).T)] = True
+    labels, _ = ndimage.label(grid, np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    of_cell = labels[tuple((index - low).T)]
+    counts = np.bincount(of_cell)
+    return [index[of_cell == i] for i in np.flatnonzero(counts >= LEAST_CELLS // 4) if i > 0]
+
+
+def _off_the_table(
+    index: Int[np.ndarray, "n 3"], floor: float
+) -> list[tuple[Int[np.ndarray, "_ 3"], bool]]:
+    """A cluster, and apart from it what stands on its table top."""
+    top = _table_top(index, floor)
+    if top is None:
+        return [(index, False)]
+    above = index[:, 1] > top + 1
+    on_top = [(one, True) for one in _connected(index[above])]
+    return [(index[~above], False), *on_top]
+
+
+def _table_top(index: Int[np.ndarray, "n 3"], floor: float) -> int | None:
+    """The height of the highest large level slice, in cells; None where there is none."""
+    heights = np.unique(index[:, 1])
+    for y in heights[::-1]:
+        if (y + 0.5 - floor) * CELL < TOP_HEIGHT:
+            return None
+        slab = np.unique(index[np.abs(index[:, 1] - y) <= 1][:, [0, 2]], axis=0)
+        if len(slab) * CELL**2 < TOP_AREA:
+            continue
+        _, size, _ = rectangle(slab.astype(float))
+        above = len(np.unique(index[index[:, 1] > y + 1][:, [0, 2]], axis=0))
+        if len(slab) > TOP_FILLED * (size[0] + 1) * (size[1] + 1) and above < 0.6 * len(slab):
+            return int(y)
+    return None
+
+
+def _joined(parts: list[Int[np.ndarray, "_ 3"]]) -> list[Int[np.ndarray, "_ 3"]]:
+    """Clusters with the fragments that stand on their footprints, as a leg that was half hidden."""
+    parts, whole = sorted(parts, key=len, reverse=True), []
+    for part in parts:
+        for i, other in enumerate(whole):
+            if _is_fragment(part, other):
+                whole[i] = np.concatenate([other, part])
+                break
+        else:
+            whole.append(part)
+    return whole
+
+
+def _is_fragment(part: Int[np.ndarray, "n 3"], whole: Int[np.ndarray, "m 3"]) -> bool:
+    if len(part) > FRAGMENT * len(whole):
+        return False
+    gap = max(part[:, 1].min() - whole[:, 1].max(), whole[:, 1].min() - part[:, 1].max())
+    yaw, size, middle = rectangle(whole[:, [0, 2]].astype(float))
+    near = (part[:, [0, 2]] - middle) @ _axes(yaw).T
+    within = (np.abs(near) < size / 2 + 1).all(axis=1).mean()
+    return bool(gap * CELL < HIGHER and within > COVERED)
+
+
+def _is_furniture(index: Int[np.ndarray, "n 3"]) -> bool:
+    size = (np.ptp(index, axis=0) + 1) * CELL
+    along = np.hypot(size[0], size[2])
+    return bool(
+        len(index) >= LEAST_CELLS
+        and along < LONGEST
+        and LEAST_HEIGHT < size[1] < TALLEST
+    )
+
+
+def _stands(index: Int[np.ndarray, "n 3"], floor: float) -> bool:
+    """Whether a cluster reaches down to the floor, nearly."""
+    return bool((index[:, 1].min() - floor) * CELL < ABOVE_FLOOR)
+
+
+# Rectangles ------------------------------------------------------------------------------------
+
+
+def rectangle(
+    points: Float[np.ndarray, "n 2"],
+) -> tuple[float, Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """The smallest rectangle around points of the floor plan.
+
+    Args:
+        points: Points along x and z `[n 2]`.
+
+    Returns:
+        The turn of its axes in radians, as of a box about the vertical; its sides; its middle.
+    """
+    yaws = np.deg2rad(np.arange(0, 90, 1.5))
+    axes = np.stack([_axes(yaw) for yaw in yaws])
+    along = np.einsum("kij,nj->kni", axes, points)
+    low, high = np.percentile(along, (0.5, 99.5), axis=1)
+    best = int(np.argmin(np.prod(high - low + 1e-9, axis=1)))
+    middle = (low[best] + high[best]) / 2 @ axes[best]
+    return float(yaws[best]), high[best] - low[best], middle
+
+
+def _axes(yaw: float) -> Float[np.ndarray, "2 2"]:
+    """The x and z axes, in the floor plan, of a box that is turned about +y."""
+    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
