@@ -35,6 +35,8 @@ from .mapping.map.mapper import Mapper, build_mapper
 from .mapping.map.recording import Progress, follow, trajectory
 from .mapping.placement.finding import Start, find_start
 from .mapping.placement.placing import Placement, PlacementConfig, place
+from .mapping.scene.classes import Decision, SceneClasses, build_classes
+from .mapping.scene.following import Scene, SceneObject, finish_scene, follow_scene
 from .mapping.segmentation.segment import Prompt, Segmentation, segment
 from .mapping.tracking.keyframes import PreparedFrame
 from .model.calibration import Calibration
@@ -112,6 +114,7 @@ __all__ = [
     "Capture",
     "CmaState",
     "Composition",
+    "Decision",
     "DistanceField",
     "Distribution",
     "FusedSurface",
@@ -140,6 +143,9 @@ __all__ = [
     "Reliability",
     "Residual",
     "SOFT",
+    "Scene",
+    "SceneClasses",
+    "SceneObject",
     "Segmentation",
     "Sensor",
     "SensorNoise",
@@ -159,6 +165,7 @@ __all__ = [
     "Weights",
     "binary",
     "bounds",
+    "build_classes",
     "build_mapper",
     "build_refiner",
     "camera_distance",
@@ -180,12 +187,14 @@ __all__ = [
     "export_reconstruct",
     "f_score",
     "find_start",
+    "finish_scene",
     "finite_or_inf",
     "fit_box",
     "fit_box_isotropic",
     "fit_calibration",
     "fit_surface",
     "follow",
+    "follow_scene",
     "fuse_frames",
     "fuse_surface",
     "gauss_newton",

@@ -7,6 +7,7 @@ that `--help` answers at once.
 
     rebuild    demo
     recording  reconstruct
+    scene      scene
     completing complete
     inspecting inspect
     learning   dataset, train
@@ -39,6 +40,7 @@ from jaxshape.cli.learning import BuildDataset, Train, preset_in
 from jaxshape.cli.options import RefusedSetting, refusing, reworded
 from jaxshape.cli.rebuild import Demo
 from jaxshape.cli.recording import Reconstruct
+from jaxshape.cli.scene import BuildScene
 from jaxshape.cli.scoring import Evaluate, Plot
 from jaxshape.cli.viewing import ViewResult
 from jaxshape.data.config import DATASETS
@@ -57,6 +59,7 @@ def commands(arguments: Sequence[str]) -> Any:
         | Annotated[BuildDataset, subcommand("dataset", default=dataset)]
         | Annotated[Train, subcommand("train", default=train)]
         | Annotated[Reconstruct, subcommand("reconstruct")]
+        | Annotated[BuildScene, subcommand("scene")]
         | Annotated[Complete, subcommand("complete")]
         | Annotated[Inspect, subcommand("inspect")]
         | Annotated[Evaluate, subcommand("evaluate")]

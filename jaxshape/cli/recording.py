@@ -99,8 +99,14 @@ class Reconstruct(Rebuild):
         placer = self.placer(prior)
         sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
         with console.status("inspecting the recording"):
-            inspected = self._inspected(sequence)
-        sequence = inspected.sequence
+            found = inspected(
+                sequence,
+                self.frames,
+                convention=self.convention,
+                keep_scale=self.depth_scale is not None,
+                guess_camera=self.guess_camera,
+            )
+        sequence = found.sequence
         require(
             self.first < len(sequence),
             f"--first is {self.first}, but there are {len(sequence)} frames, counted from 0.",
@@ -110,7 +116,7 @@ class Reconstruct(Rebuild):
         prompt = Prompt(self.click, self.region, self.depth_range, self.object)
         check_prompt(prompt, sequence.shape)
         box = read_box(self.box) if self.box else None
-        use_poses = self._use_poses(inspected)
+        use_poses = poses_used(found, self.frames, self.poses)
         mapper = build_mapper(prior, refiner, search, self.mapping, self.tracking, seed=self.seed)
         figures: dict[str, Any] = {
             "object": str(self.frames),
@@ -126,7 +132,7 @@ class Reconstruct(Rebuild):
             "convention": self.convention,
             "prior": fingerprint(prior),
         }
-        figures["warnings"] = [warning.sentence for warning in inspected.warnings]
+        figures["warnings"] = [warning.sentence for warning in found.warnings]
         for warning in figures["warnings"]:
             warn(warning)
         earlier = None
@@ -134,7 +140,7 @@ class Reconstruct(Rebuild):
             earlier = load_state(self.output, sequence, prior, settings, self.mapping)
         if earlier is None:
             with console.status("finding the object"):
-                found = find_start(
+                seen = find_start(
                     sequence,
                     placer,
                     prompt,
@@ -143,17 +149,17 @@ class Reconstruct(Rebuild):
                     use_pose=self.poses != "none",
                 )
         else:
-            found = earlier.start
+            seen = earlier.start
             console.print(f"going on after frame {earlier.logs[-1].name}", markup=False)
-        for note in found.notes:
+        for note in seen.notes:
             console.print(note, highlight=False, markup=False)
-        chosen = range(found.index, len(sequence), self.every)
+        chosen = range(seen.index, len(sequence), self.every)
         progress, next_write = earlier, time.perf_counter() + _SECONDS_BETWEEN_WRITES
         with progress_bar("frames") as bar:
             task = bar.add_task("follow", total=len(chosen), note="")
             for progress in follow(
                 sequence,
-                found,
+                seen,
                 mapper,
                 placer,
                 chosen=chosen,
@@ -182,19 +188,6 @@ class Reconstruct(Rebuild):
         if result["verdict"] == "failed":
             sys.exit(3)
 
-    def _inspected(self, sequence: Any) -> Any:
-        """The recording as it is to be read, and what was noticed; refuses a guessed camera."""
-        from jaxshape.data.sequences.inspection import inspect_sequence
-
-        require(
-            self.guess_camera or not sequence.camera_is_guess,
-            f"{str(self.frames)!r} holds no camera, and a focal length that is wrong by 5 % bends "
-            "the surface: write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt there, or add "
-            f"--guess-camera to take that of {sequence.camera}.",
-        )
-        stated, keep_scale = self.convention or None, self.depth_scale is not None
-        return inspect_sequence(sequence, stated, keep_scale=keep_scale)
-
     def _list_objects(self, sequence: Any) -> None:
         """Write a picture of what the first frame shows, and the size of each object."""
         from jaxshape.mapping.placement.finding import first_readable
@@ -211,28 +204,6 @@ class Reconstruct(Rebuild):
             size = " x ".join(f"{extent:.2f}" for extent in one.size)
             print(f"{number}: {size} m (width, height, depth), {one.distance:.2f} m away")
         print(f"wrote {picture} of {frame.name}; take one with --object and its number")
-
-    def _use_poses(self, inspected: Any) -> bool:
-        """Whether all given poses are used; refuses options that contradict the recording."""
-        from jaxshape.data.sequences.inspection import BADLY
-
-        has_poses, poses = inspected.sequence.has_poses, inspected.poses
-        if self.poses in ("given", "first"):
-            require(
-                has_poses,
-                f"--poses is {self.poses}, but {str(self.frames)!r} has none; leave it out.",
-            )
-        if self.poses in ("none", "first") or not has_poses:
-            return False
-        best = poses.reading.best
-        hint = "" if best is None else f"{best.convention.options} would make it {best.share:.0%}; "
-        require(
-            poses.reading.pairs == 0 or poses.agreement >= BADLY,
-            f"The poses in {str(self.frames)!r} agree with the depth images on "
-            f"{poses.agreement:.0%} of the pixels only, and would tear the surface: {hint}"
-            "state how they are written with --convention, or add --poses none to track instead.",
-        )
-        return True
 
     def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
         """Draw the pictures and the report, and print a summary."""
@@ -260,3 +231,43 @@ _SECONDS_BETWEEN_WRITES = 3.0
 
 def _note(progress: Any) -> str:
     return f"{len(progress.state.keyframes)} keyframes"
+
+
+def inspected(
+    sequence: Any,
+    frames: Path,
+    *,
+    convention: tuple[ConventionName, ...],
+    keep_scale: bool,
+    guess_camera: bool,
+) -> Any:
+    """The recording as it is to be read, and what was noticed; refuses a guessed camera."""
+    from jaxshape.data.sequences.inspection import inspect_sequence
+
+    require(
+        guess_camera or not sequence.camera_is_guess,
+        f"{str(frames)!r} holds no camera, and a focal length that is wrong by 5 % bends "
+        "the surface: write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt there, or add "
+        f"--guess-camera to take that of {sequence.camera}.",
+    )
+    return inspect_sequence(sequence, convention or None, keep_scale=keep_scale)
+
+
+def poses_used(found: Any, frames: Path, poses: str) -> bool:
+    """Whether all given poses are used; refuses options that contradict the recording."""
+    from jaxshape.data.sequences.inspection import BADLY
+
+    has_poses, read = found.sequence.has_poses, found.poses
+    if poses in ("given", "first"):
+        require(has_poses, f"--poses is {poses}, but {str(frames)!r} has none; leave it out.")
+    if poses in ("none", "first") or not has_poses:
+        return False
+    best = read.reading.best
+    hint = "" if best is None else f"{best.convention.options} would make it {best.share:.0%}; "
+    require(
+        read.reading.pairs == 0 or read.agreement >= BADLY,
+        f"The poses in {str(frames)!r} agree with the depth images on "
+        f"{read.agreement:.0%} of the pixels only, and would tear the surface: {hint}"
+        "state how they are written with --convention, or add --poses none to track instead.",
+    )
+    return True

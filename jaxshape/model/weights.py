@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,36 @@ MODELS = {model.kind: model for model in (AUTOENCODER, COMPLETION, PCA)}
 PACKAGED = ("chair", "chair-autoencoder")
 """Weights that come with the package: of the network that is conditioned on the measurement, and of
 the paper's auto-encoder."""
+
+
+CLASSES = ("chair", "table")
+"""Classes whose weights come with the package, where they are among `PACKAGED`."""
+
+
+def load_scene_priors(
+    further: Mapping[str, str | os.PathLike[str]],
+) -> tuple[dict[str, ShapePrior], dict[str, ShapePrior]]:
+    """The priors of all classes that a scene may hold, and those that find their boxes. [host]
+
+    Args:
+        further: Weights of further classes, or of the package's classes in place of its own, by the
+            name of the class.
+
+    Returns:
+        The priors, and the priors that find boxes, by the name of the class; a class that is not
+        among the latter is placed by its own prior.
+
+    Raises:
+        WeightsError: A file cannot be read.
+    """
+    packaged = {name: name for name in CLASSES if name in PACKAGED}
+    priors = {name: load_prior(where) for name, where in {**packaged, **further}.items()}
+    placers = {
+        name: load_prior(f"{name}-autoencoder")
+        for name in packaged
+        if name not in further and f"{name}-autoencoder" in PACKAGED
+    }
+    return priors, placers
 
 
 def packaged_for(family: str) -> str:

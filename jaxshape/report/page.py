@@ -32,7 +32,8 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     that comes from the folder is escaped.
 
     Args:
-        folder: Folder of a result, from `jaxshape demo` or `jaxshape reconstruct`, finished or not.
+        folder: Folder of a result, from `jaxshape demo`, `jaxshape reconstruct` or `jaxshape
+            scene`, finished or not.
 
     Returns:
         The path of the page.
@@ -44,6 +45,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     scene = illustrations.scene(found)
     sections = [
         _warnings(found),
+        tables.objects(found),
         _shape(found, scene),
         _grids(found),
         _keyframes(found),

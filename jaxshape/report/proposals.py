@@ -23,25 +23,29 @@ def write_proposals(
     depth: Float[np.ndarray, "h w"],
     color: UInt8[np.ndarray, "h w 3"] | None,
     proposals: Sequence[Bool[np.ndarray, "h w"]],
+    numbers: Sequence[int] | None = None,
 ) -> None:
-    """Write a picture of a frame in which each object has a colour and its number, from 1.
+    """Write a picture of a frame in which each object has a colour and its number.
 
     Args:
         path: The picture; its suffix names the format.
         depth: Depth image `[h w]`, in metres, which is shown in grey where there is no colour.
         color: Colour image `[h w 3]`; None for none.
         proposals: Pixels of each object `[h w]`.
+        numbers: Their numbers; None for 1, 2, ...
     """
+    numbers = range(1, len(proposals) + 1) if numbers is None else numbers
+    colors = [CYCLE[(number - 1) % len(CYCLE)] for number in numbers]
     canvas = np.array(_grey(depth) if color is None else color, np.float64)
-    for number, segmented in enumerate(proposals):
-        tint = 255 * rgb(CYCLE[number % len(CYCLE)])
+    for color_of, segmented in zip(colors, proposals, strict=True):
+        tint = 255 * rgb(color_of)
         canvas[segmented] = (1 - _TINT) * canvas[segmented] + _TINT * tint
     k = max(1, round(_WIDTH / depth.shape[1]))
     image = Image.fromarray(np.rint(canvas).astype(np.uint8))
     image = image.resize((k * image.width, k * image.height), Image.Resampling.NEAREST)
-    for number, segmented in enumerate(proposals):
+    for number, color_of, segmented in zip(numbers, colors, proposals, strict=True):
         row, column = _middle(segmented)
-        _write_number(image, str(number + 1), (k * column, k * row), CYCLE[number % len(CYCLE)])
+        _write_number(image, str(number), (k * column, k * row), color_of)
     with atomic_path(path) as temporary:
         image.save(temporary)
 

@@ -62,6 +62,37 @@ def keyframe_table(keyframes: Sequence[KeyframeRecord]) -> str:
     return _folded("Figures of each keyframe", about + table)
 
 
+def objects(found: ResultFolder) -> str:
+    """The objects of a scene, and what became of them while it was filmed."""
+    entries = found.result.get("objects")
+    if not isinstance(entries, list):
+        return ""
+    rows = [_object_row(one) for one in entries if isinstance(one, dict)]
+    heading = ("object", "class", "sure", "width × height × depth", "verdict")
+    events = "".join(f"<li>{escape(str(event))}</li>" for event in found.result.get("events") or ())
+    about = (
+        '<p class="soft">An object of no class is kept as it was measured; nothing is added to '
+        "it.</p>"
+    )
+    story = f"<details><summary>What was found, and when</summary><ol>{events}</ol></details>"
+    return f"<section><h2>Objects</h2>{about}{html_table(heading, rows)}{story}</section>"
+
+
+def _object_row(one: dict[str, Any]) -> tuple[str, ...]:
+    reasons = "; ".join(map(str, one.get("verdict_reasons") or ()))
+    size = one.get("size")
+    extents = " × ".join(number(x, 2) for x in size) if isinstance(size, list) else ""
+    verdict = f"{one.get('verdict') or ''}{': ' if reasons else ''}{reasons}"
+    cells = (
+        str(one.get("name", "")),
+        str(one.get("class") or "none"),
+        number(one.get("sure"), times=100.0, unit=" %"),
+        f"{extents} m" if extents else "",
+        verdict,
+    )
+    return tuple(map(escape, cells))
+
+
 def frame_strip(found: ResultFolder) -> str:
     """A strip with a colour for each frame, and the runs of frames that fared alike."""
     if not found.frames:

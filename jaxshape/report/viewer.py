@@ -35,7 +35,7 @@ from jaxshape.results.folder import (
 )
 from jaxshape.results.summary import headline, tracked, warnings_of
 
-WATCHED = ("mesh.ply", "grid.npz", "keyframes.json", "result.json")
+WATCHED = ("mesh.ply", "grid.npz", "keyframes.json", "result.json", "scene.json")
 PLAIN = "one colour"
 SECONDS_BETWEEN_LOOKS = 0.5
 LINES: Any = {"thickness": 2.0, "thickness_units": "screen"}

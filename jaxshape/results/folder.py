@@ -42,7 +42,7 @@ class ResultFolder(NamedTuple):
 
     Attributes:
         name: Name of the folder.
-        result: Content of result.json.
+        result: Content of result.json, or of scene.json where there are several objects.
         mesh: Mesh in the world frame, in metres.
         measured: True for its vertices on the measured surface; None where that is not known.
         confidence: Probability that there is surface at its vertices; None where that is not known.
@@ -110,7 +110,8 @@ def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
     mesh, measured, color, confidence = read("mesh.ply", read_ply, (None,) * 4)
     return ResultFolder(
         name=folder.resolve().name,
-        result=read("result.json", reading.read_json_object, {}),
+        result=read("result.json", reading.read_json_object, None)
+        or read("scene.json", reading.read_json_object, {}),
         mesh=mesh,
         measured=measured,
         confidence=confidence,

@@ -111,6 +111,16 @@ def write_shape(
     in metres. The trace has a row for each iteration of the search; there is none of the encoder
     alone.
     """
+    return write_shape_mesh(folder, observation, reconstruction, figures)[0]
+
+
+def write_shape_mesh(
+    folder: Path,
+    observation: Observation,
+    reconstruction: Reconstruction,
+    figures: dict[str, Any],
+) -> tuple[dict[str, Any], "ShapeMesh"]:
+    """Write what `write_shape` writes; returns its figures and the mesh."""
     one = only(reconstruction)
     found = shape_mesh(observation, one.composed, one.fill_logits, one.probability)
     flags = {"measured": found.measured, "color": found.color, "confidence": found.confidence}
@@ -123,9 +133,9 @@ def write_shape(
     else:
         write_trace(folder / "trace.npz", jax.tree.map(lambda x: x[: one.iterations], one.trace))
     told = {**figures, **_searched(one), **_of_mesh(found), **_measured(observation, one)}
-    if not observation.keyframes and observation.cloud is None:
-        return told
-    return told | _judged(observation, found, bool(one.symmetric))
+    if observation.keyframes or observation.cloud is not None:
+        told |= _judged(observation, found, bool(one.symmetric))
+    return told, found
 
 
 class ShapeMesh(NamedTuple):

@@ -55,8 +55,8 @@ def write_progress(
     Returns:
         Content of `result.json`.
     """
-    _write_pictures(folder / "keyframes", sequence, progress)
-    _write_trajectory(folder, sequence, progress)
+    write_pictures(folder / "keyframes", sequence, progress)
+    write_trajectories(folder, sequence, progress)
     observation = observation_of(progress.state)
     if observation.field is not None:
         observation = observation._replace(views=color_views(sequence, progress))
@@ -76,7 +76,7 @@ def write_progress(
         result["running"] = True
     if progress.shape is not None:
         result = write_shape(folder, observation, progress.shape, result)
-    write_json(folder / "keyframes.json", _keyframes(sequence, progress))
+    write_json(folder / "keyframes.json", keyframe_entries(sequence, progress))
     write_json(folder / "result.json", result)
     return result
 
@@ -161,8 +161,14 @@ def _fused(progress: Progress) -> Iterator[tuple[FrameLog, Keyframe]]:
     return (pair for pair in progress.of_keyframes() if np.asarray(pair[1].segmented).any())
 
 
-def _write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> None:
-    """Colour, depth and mask of each keyframe, at working size; those that are there stay."""
+def write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> None:
+    """Colour, depth and mask of each keyframe, at working size; those that are there stay.
+
+    Args:
+        folder: The folder of the pictures.
+        sequence: The recording.
+        progress: Progress of the run.
+    """
     for log, keyframe in _fused(progress):
         segmented = np.asarray(keyframe.segmented)
         _write_image(folder / f"{log.name}.mask.png", segmented.astype(np.uint8) * 255)
@@ -185,7 +191,13 @@ def _write_image(path: Path, pixels: np.ndarray) -> None:
         Image.fromarray(pixels).save(temporary)
 
 
-def _keyframes(sequence: Sequence, progress: Progress) -> dict[str, Any]:
+def keyframe_entries(sequence: Sequence, progress: Progress) -> dict[str, Any]:
+    """The content of keyframes.json.
+
+    Args:
+        sequence: The recording.
+        progress: Progress of the run.
+    """
     poses = trajectory(progress)
     first = progress.state.keyframes[0]
     return {
@@ -227,7 +239,14 @@ def _frame_entry(log: FrameLog, poses: dict[int, np.ndarray]) -> dict[str, Any]:
     }
 
 
-def _write_trajectory(folder: Path, sequence: Sequence, progress: Progress) -> None:
+def write_trajectories(folder: Path, sequence: Sequence, progress: Progress) -> None:
+    """Write trajectory.txt and trajectory.log.
+
+    Args:
+        folder: The result folder.
+        sequence: The recording.
+        progress: Progress of the run.
+    """
     poses = trajectory(progress)
     index = np.array(sorted(poses))
     times = None if sequence.times is None else sequence.times[index]

@@ -14,6 +14,7 @@ from trimesh.visual import ColorVisuals
 from jaxshape import limits, reading
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.results.glb import Node, write_glb
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 
@@ -115,11 +116,11 @@ def write_mesh(
             f"A mesh is written as one of {', '.join(MESH_SUFFIXES)}, but {str(path)!r} ends in "
             f"{suffix or 'no suffix'!r}."
         )
+    if suffix == ".glb":
+        write_glb(path, [Node("object", mesh, measured, color, confidence)])
+        return
     copy = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     with atomic_path(path) as temporary:
-        if suffix == ".glb":
-            _export_glb(copy, temporary, measured, color, confidence)
-            return
         if color is not None:
             copy.visual = ColorVisuals(copy, vertex_colors=color)
         if measured is not None and suffix == ".ply":
@@ -127,39 +128,6 @@ def write_mesh(
         if confidence is not None and suffix == ".ply":
             copy.vertex_attributes["confidence"] = confidence.astype(np.float32)
         copy.export(temporary)
-
-
-def _export_glb(
-    mesh: trimesh.Trimesh,
-    path: Path,
-    measured: Bool[np.ndarray, " n"] | None,
-    color: UInt8[np.ndarray, "n 3"] | None,
-    confidence: Float[np.ndarray, " n"] | None,
-) -> None:
-    """Write a GLB with normals, so that viewers shade it smoothly, and a dull material."""
-    if measured is not None:
-        mesh.vertex_attributes["_MEASURED"] = measured.astype(np.float32)
-    if confidence is not None:
-        mesh.vertex_attributes["_CONFIDENCE"] = confidence.astype(np.float32)
-    if color is not None:
-        linear = _linear_light(color)
-        mesh.vertex_attributes["_COLOR_0"] = np.insert(linear, 3, 1, axis=1).astype(np.float32)
-
-    def finish(tree: dict[str, Any]) -> None:
-        for part in tree["meshes"][0]["primitives"]:
-            part["material"] = 0
-            if color is not None:
-                part["attributes"]["COLOR_0"] = part["attributes"].pop("_COLOR_0")
-        dull = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
-        tree["materials"] = [{"pbrMetallicRoughness": dull, "doubleSided": True}]
-
-    mesh.export(path, include_normals=True, tree_postprocessor=finish)
-
-
-def _linear_light(color: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """sRGB as linear light, 0 to 1 (IEC 61966-2-1)."""
-    share = color / 255
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 class MeshFile(NamedTuple):

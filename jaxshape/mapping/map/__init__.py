@@ -1,1 +1,1 @@
-"""The map of one object: keyframes, fused and realigned with the shape that explains them."""
+"""The maps of objects: keyframes, fused and realigned with the shapes that explain them."""

@@ -49,13 +49,17 @@ def doubts_of(progress: Progress) -> tuple[str, ...]:
     Returns:
         A sentence for each; none about a box that was given.
     """
+    return (*unreadable(progress), *_empty(progress), *unseen_in_words(progress))
+
+
+def unseen_in_words(progress: Progress) -> tuple[str, ...]:
+    """Warnings of what was not seen of the object: of its box and of its legs.
+
+    Args:
+        progress: Progress of a recording.
+    """
     unseen, height = unseen_of(progress), float(progress.start.box.size[1])
-    return (
-        *_unreadable(progress),
-        *_empty(progress),
-        *_of_faces(unseen),
-        *_of_legs(unseen, height),
-    )
+    return (*_of_faces(unseen), *_of_legs(unseen, height))
 
 
 def unseen_of(progress: Progress) -> Unseen:
@@ -73,7 +77,12 @@ def unseen_of(progress: Progress) -> Unseen:
     return Unseen(_faces(progress.start, views), _below(box, views))
 
 
-def _unreadable(progress: Progress) -> tuple[str, ...]:
+def unreadable(progress: Progress) -> tuple[str, ...]:
+    """A warning of frames that cannot be read, if there are any.
+
+    Args:
+        progress: Progress of a recording.
+    """
     logs = [log for log in progress.logs if log.status == "unreadable"]
     if not logs:
         return ()

@@ -1,12 +1,12 @@
 """The classes that objects of a scene may be of, and how one is decided. [host]
 
 Each class has a prior. An object is of the class whose prior predicts hidden parts of it clearly
-better than anything else does that is not made for it: the priors of other classes, and its own
-prior with the front turned away. A plant is predicted alike from all sides, badly; a cube alike
-from all sides, well; a chair well from its front alone.
+better than anything else does that is not made for it: the priors of other classes and, where its
+objects have a front, its own prior with the front turned away. A plant is predicted alike from all
+sides, badly; a cube alike from all sides, well; a chair well from its front alone.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -92,6 +92,10 @@ standard deviations of their logarithms."""
 _SEARCH, _MAPPING, _TRACKING = RefineConfig(), MappingConfig(), TrackingConfig()
 
 
+FRONTLESS = ("table",)
+"""Classes whose objects look alike from all sides."""
+
+
 def sizes_of(name: str) -> PlacementConfig:
     """Usual sizes of a class, for a short search of the box: a box is known beforehand.
 
@@ -155,17 +159,17 @@ WORST = -1.45
 """Log-likelihood of hidden surface voxels below which no class predicts an object."""
 
 
-def decide(classes: Sequence[SceneClass], grids: Grids) -> list[Decision]:
+def decide(priors: Mapping[str, ShapePrior], grids: Grids) -> list[Decision]:
     """The class and the front of each object; all objects go through one call for each class.
 
     Args:
-        classes: The classes, one or more.
+        priors: The prior of each class, by its name; one or more.
         grids: F and M of each object `[object x y z]`, in boxes with any front.
     """
     count = len(grids.occupied)
     rows = jnp.minimum(jnp.arange(1 << (count - 1).bit_length()), count - 1)
     padded = Grids(grids.occupied[rows], grids.occluded[rows])
-    found = {one.name: predict_hidden(one.prior, padded) for one in classes}
+    found = {name: predict_hidden(prior, padded) for name, prior in priors.items()}
     return [
         decided({name: Predicted(*(np.asarray(x)[i] for x in of)) for name, of in found.items()})
         for i in range(count)
@@ -183,7 +187,9 @@ def decided(found: Mapping[str, Predicted]) -> Decision:
     for name, own in total.items():
         fronts[name] = int(own.argmax())
         rivals = [other.max() for rival, other in total.items() if rival != name]
-        margins[name] = float(own.max() - max([np.delete(own, fronts[name]).max(), *rivals]))
+        if name not in FRONTLESS:
+            rivals.append(np.delete(own, fronts[name]).max())
+        margins[name] = float(own.max() - max(rivals)) if rivals else 0.0
     best = max(margins, key=lambda name: margins[name])
     likely = _sigmoid((margins[best] - MARGIN) / SPREAD)
     if total[best].max() < WORST:

@@ -60,7 +60,7 @@ def turned(grid: Array, quarters: int) -> Array:
         grid: The grid.
         quarters: Quarters of a turn of the front, from +z to +x.
     """
-    return jnp.rot90(grid, -quarters, axes=(-3, -1))
+    return jnp.rot90(grid, quarters, axes=(-3, -1))
 
 
 @jax.jit

@@ -274,7 +274,7 @@ def _decided(objects: tuple[SceneObject, ...], classes: SceneClasses) -> list[Sc
     stacked = Grids(
         jnp.stack([one.occupied for one in grids]), jnp.stack([one.occluded for one in grids])
     )
-    decisions = decide(classes.known, stacked)
+    decisions = decide({one.name: one.prior for one in classes.known}, stacked)
     return [one._replace(decision=d) for one, d in zip(objects, decisions, strict=True)]
 
 

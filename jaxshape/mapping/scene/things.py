@@ -66,8 +66,10 @@ def told_apart(before: Told, clusters: Sequence[Cluster]) -> Told:
         [[len(np.intersect1d(one.keys, k, assume_unique=True)) for k in keys]
          for one in before.things], int,
     ).reshape(len(before.things), len(keys))  # fmt: skip
-    least = np.array([[min(len(one.keys), len(k)) for k in keys] for one in before.things])
-    same = _matched(shared, least.reshape(shared.shape))
+    least = np.array(
+        [[min(len(one.keys), len(k)) for k in keys] for one in before.things], int
+    ).reshape(shared.shape)
+    same = _matched(shared, least)
     events, things, numbers = [], [], before.numbers
     for j, cluster in enumerate(clusters):
         i = same.get(j)

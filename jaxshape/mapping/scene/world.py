@@ -27,7 +27,7 @@ THROUGH = 0.05
 NOISE = 4.8e-3
 """Three standard deviations of depth at 1 m, in metres; they grow with the square of depth."""
 
-TOP_HEIGHT, TOP_AREA, TOP_FILLED = 0.45, 0.16, 0.6
+TOP_HEIGHT, TOP_AREA, TOP_FILLED = 0.58, 0.2, 0.6
 """A level slice of a cluster is a table top from this height above the floor, in metres, this area,
 in square metres, and this share of the rectangle around it. Seats are smaller or have a back."""
 
@@ -267,11 +267,7 @@ def _is_fragment(part: Int[np.ndarray, "n 3"], whole: Int[np.ndarray, "m 3"]) ->
 def _is_furniture(index: Int[np.ndarray, "n 3"]) -> bool:
     size = (np.ptp(index, axis=0) + 1) * CELL
     along = np.hypot(size[0], size[2])
-    return bool(
-        len(index) >= LEAST_CELLS
-        and along < LONGEST
-        and LEAST_HEIGHT < size[1] < TALLEST
-    )
+    return bool(len(index) >= LEAST_CELLS and along < LONGEST and LEAST_HEIGHT < size[1] < TALLEST)
 
 
 def _stands(index: Int[np.ndarray, "n 3"], floor: float) -> bool:

@@ -1,0 +1,173 @@
+"""`jaxshape scene`: all objects of a room from a recording."""
+
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+from tyro.conf import Positional
+
+from jaxshape import checks
+from jaxshape.claim import Output
+from jaxshape.cli.common import console, progress_bar, require, warn
+from jaxshape.cli.inspecting import ConventionName
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.search.config import RefineConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildScene:
+    """Rebuild all objects of a room from an RGB-D recording, each of its own class.
+
+    Whatever has the size of furniture and stands on the floor or on a table becomes an object. The
+    priors decide what it is and which way it looks; what is of none of their classes is kept as it
+    was measured, and nothing is added to it. What was moved while it was filmed is left out.
+
+    Examples: jaxshape scene room/
+
+    jaxshape scene room/ --prior table table.safetensors
+
+    jaxshape scene room/ --every 5 --poses none
+    """
+
+    frames: Positional[Path]
+    """Folder of a recording; `jaxshape inspect` says what it holds."""
+    prior: dict[str, Path] = field(default_factory=dict)
+    """Classes and their weights, besides those that come with the package: NAME FILE ..."""
+    method: str | None = None
+    """How codes are searched, as of `jaxshape reconstruct`; None for the usual way of each
+    network."""
+    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
+    seed: int = 0
+    """Seed of all random numbers, 0 or more."""
+    poses: Literal["auto", "none"] = "auto"
+    """Given poses to use: all (auto: where there are any), or none."""
+    first: int = 0
+    """Number of the first frame, from 0."""
+    every: int = 1
+    """Use every n-th frame, n being 1 or more."""
+    depth_scale: float | None = None
+    """Depth units in a metre, above 0; found out by default, or those of the layout."""
+    convention: tuple[ConventionName, ...] = ()
+    """Conventions in which poses and depth are written; found out by default."""
+    guess_camera: bool = False
+    """Take the usual camera of such recordings where the folder holds none."""
+    tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
+    mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
+    output: Path = Path("out/scene")
+    """Folder for scene.glb, scene.json, mesh.ply, objects.png, objects/, report.html and more."""
+
+    def __post_init__(self) -> None:
+        checks.seed("seed", self.seed)
+        checks.whole("every", self.every, 1)
+        checks.whole("first", self.first, 0)
+
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.output)
+
+    def run(self) -> None:
+        start = time.perf_counter()
+        from jaxshape.cli.recording import inspected, poses_used
+        from jaxshape.data.sequences import open_sequence
+        from jaxshape.mapping.scene.classes import build_classes
+        from jaxshape.mapping.scene.following import finish_scene, follow_scene
+        from jaxshape.model.weights import load_scene_priors
+        from jaxshape.report.page import write_report
+        from jaxshape.results.scene_files import write_scene
+
+        priors, placers = load_scene_priors(self.prior)
+        classes = build_classes(
+            priors,
+            placers=placers,
+            method=self.method,
+            search=self.search,
+            mapping=self.mapping,
+            track=self.tracking,
+            seed=self.seed,
+        )
+        sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
+        with console.status("inspecting the recording"):
+            found = inspected(
+                sequence,
+                self.frames,
+                convention=self.convention,
+                keep_scale=self.depth_scale is not None,
+                guess_camera=self.guess_camera,
+            )
+        sequence = found.sequence
+        require(
+            self.first < len(sequence),
+            f"--first is {self.first}, but there are {len(sequence)} frames, counted from 0.",
+        )
+        use_poses = poses_used(found, self.frames, self.poses)
+        figures: dict[str, Any] = {
+            "object": str(self.frames),
+            "seed": self.seed,
+            "classes": list(priors),
+            "mapping": asdict(self.mapping),
+            "tracking": asdict(self.tracking),
+            "warnings": [warning.sentence for warning in found.warnings],
+        }
+        for warning in figures["warnings"]:
+            warn(warning)
+        chosen = range(self.first, len(sequence), self.every)
+        scene = None
+        with progress_bar("frames") as bar:
+            task = bar.add_task("follow", total=len(chosen), note="")
+            for scene in follow_scene(
+                sequence, classes, chosen=chosen, first=self.first, use_poses=use_poses
+            ):
+                note = f"{len(scene.objects)} objects"
+                bar.update(task, completed=len(scene.logs), note=note)
+        assert scene is not None  # there is at least the first frame
+        with console.status("deciding what the objects are"):
+            scene = finish_scene(scene, classes)
+        figures["seconds"] = round(time.perf_counter() - start, 2)
+        with console.status("writing"):
+            result = write_scene(self.output, sequence, scene, figures)
+            self._picture(sequence, scene)
+            write_report(self.output)
+        self._conclude(result)
+
+    def _picture(self, sequence: Any, scene: Any) -> None:
+        """Write objects.png: the keyframe that shows most of the objects."""
+        import numpy as np
+
+        from jaxshape.report.proposals import write_proposals
+
+        if not scene.objects:
+            return
+        logs = [log for log in scene.logs if log.status == "keyframe"]
+        shown = [
+            [np.asarray(one.progress.state.keyframes[k].segmented) for one in scene.objects]
+            for k in range(len(logs))
+        ]
+        k = max(range(len(logs)), key=lambda k: sum(np.sqrt(one.sum()) for one in shown[k]))
+        keyframe = scene.camera.state.keyframes[k]
+        color = sequence[logs[k].index].color
+        h, w = keyframe.depth.shape
+        if color is not None:
+            step = color.shape[1] // w
+            color = color[step // 2 :: step, step // 2 :: step][:h, :w]
+        numbers = [one.thing.number for one in scene.objects]
+        picture = self.output / "objects.png"
+        write_proposals(picture, np.asarray(keyframe.depth), color, shown[k], numbers)
+
+    def _conclude(self, result: dict[str, Any]) -> None:
+        """Print a summary: a line for each object."""
+        print(f"{result['frames']} frames, {result['keyframes']} of them keyframes")
+        for one in result["objects"]:
+            size = " x ".join(f"{extent:.2f}" for extent in one["size"])
+            what = one["class"] or "none of the classes"
+            reasons = "; ".join(one["verdict_reasons"])
+            because = f" because {reasons}" if reasons else ""
+            print(
+                f"{one['name']}: {what} ({one['sure']:.0%} sure), {size} m, "
+                f"{one['verdict']}{because}"
+            )
+        for warning in result["warnings"]:
+            warn(warning)
+        print(f"wrote scene.glb, scene.json, objects.png, report.html and more to {self.output}")

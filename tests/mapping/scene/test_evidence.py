@@ -1,0 +1,124 @@
+"""What priors predict of hidden parts, and the classes and fronts that follow."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from known_shape import known_shape
+
+from jaxshape.data.boxes import Box
+from jaxshape.data.chairs import random_chair
+from jaxshape.data.tables import random_table
+from jaxshape.geometry.grids import Grids
+from jaxshape.mapping.scene.boxing import turned_box
+from jaxshape.mapping.scene.classes import decide, decided, unfilled
+from jaxshape.mapping.scene.evidence import TURNS, hidden_parts, predict_hidden, turned
+
+
+@pytest.fixture(scope="module")
+def meshes():
+    return {"chair": random_chair(2, style="side chair"), "table": random_table(4)}
+
+
+@pytest.fixture(scope="module")
+def priors(meshes):
+    return {name: known_shape(mesh, mesh.extents) for name, mesh in meshes.items()}
+
+
+def measured(one, quarters=0):
+    """A whole measurement of what a prior knows, in a box whose front is turned away."""
+    occupied = turned(jnp.float32(one.params["mean"]), -quarters)
+    return Grids(occupied, jnp.zeros_like(occupied))
+
+
+def stacked(*grids):
+    return Grids(*(jnp.stack(x) for x in list(zip(*grids, strict=True))[:2]))
+
+
+def test_a_grid_is_turned_as_the_box_is():
+    """Voxels of a turned grid lie where they lay in the world."""
+    rng = np.random.default_rng(0)
+    grid, size = rng.random((6, 6, 6)), np.array([1.0, 2.0, 3.0])
+    box = Box(np.eye(4), size)
+
+    def centers(box):
+        unit = (np.stack(np.indices((6, 6, 6)), -1) + 0.5) / 6 - 0.5
+        T = box.T_world_object
+        return (unit * box.size) @ T[:3, :3].T + T[:3, 3]
+
+    where = centers(box).reshape(-1, 3).round(6) + 0.0
+    value = dict(zip(map(tuple, where), grid.ravel(), strict=True))
+    for quarters in range(TURNS):
+        found = np.asarray(turned(jnp.asarray(grid), quarters)).ravel()
+        where = centers(turned_box(box, quarters)).reshape(-1, 3).round(6)
+        np.testing.assert_allclose(found, [value[tuple(p + 0.0)] for p in where], rtol=1e-6)
+
+
+def test_every_voxel_is_hidden_and_seen_equally_often():
+    hidden = hidden_parts(32)
+    np.testing.assert_array_equal(hidden.sum(axis=0), len(hidden) / 2)
+
+
+@pytest.mark.parametrize("quarters", range(TURNS))
+def test_class_and_front_are_those_of_the_prior_that_knows_the_object(priors, quarters):
+    grids = stacked(*(measured(one, quarters) for one in priors.values()))
+    chair, table = decide(priors, grids)
+    assert (chair.name, chair.quarters) == ("chair", quarters)
+    assert chair.sure > 0.9
+    assert table.name == "table"  # its front may look any way
+
+
+def test_noise_is_of_no_class(priors):
+    rng = np.random.default_rng(0)
+    occupied = jnp.float32(rng.random((32, 32, 32)) < 0.1)
+    (found,) = decide(priors, stacked(Grids(occupied, jnp.zeros_like(occupied))))
+    assert found.name is None
+
+
+def test_what_is_decided_does_not_depend_on_what_stands_beside(priors):
+    chair, table = (measured(one) for one in priors.values())
+    alone = decide(priors, stacked(chair))[0]
+    among = decide(priors, stacked(table, chair, table))[1]
+    assert (alone.name, alone.quarters) == (among.name, among.quarters)
+    assert alone.sure == pytest.approx(among.sure, abs=1e-4)
+
+
+def test_scores_are_means_over_the_hidden_voxels(priors):
+    """Against a slow sum, for one prior and one turn."""
+    one = priors["chair"]
+    grids = measured(one)
+    found = predict_hidden(one, stacked(grids))
+    F = np.asarray(grids.occupied)
+    logits = []
+    from jaxshape.model.shapes import decode, encode
+
+    for hidden in hidden_parts(32):
+        rows = Grids(jnp.where(hidden, 0, F)[None], jnp.float32(hidden)[None])
+        logits.append(np.asarray(decode(one, encode(one, rows)))[0])
+    slow = [
+        np.mean(-np.log1p(np.exp(-x[hidden & (F > 0)])))
+        for x, hidden in zip(logits, hidden_parts(32), strict=True)
+    ]
+    assert float(found.surface[0, 0]) == pytest.approx(np.mean(slow), rel=1e-3)
+
+
+def test_nothing_is_added_to_an_object_of_no_class(priors):
+    grids = measured(priors["chair"])
+    shape = unfilled(grids, jnp.zeros(6))
+    np.testing.assert_array_equal(shape.composed[0], np.asarray(grids.occupied) > 0)
+    assert not shape.completed.any() and (shape.fill_logits < -10).all()
+
+
+def test_a_decision_needs_more_than_the_best_of_bad_answers():
+    worse = decided({"chair": _scores([-3.0, -4, -4, -4])})
+    assert worse.name is None
+    clear = decided({"chair": _scores([-1.4, -1.0, -1.5, -1.4]), "table": _scores([-1.6] * 4)})
+    assert (clear.name, clear.quarters) == ("chair", 1)
+    tied = decided({"chair": _scores([-1.0] * 4), "table": _scores([-1.0] * 4)})
+    assert tied.name is None
+
+
+def _scores(surface):
+    from jaxshape.mapping.scene.evidence import Predicted
+
+    x = np.array(surface)
+    return Predicted(x, 0 * x, 0 * x, 0 * x)
