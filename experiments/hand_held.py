@@ -24,11 +24,11 @@ import jaxlie
 import numpy as np
 import trimesh
 import tyro
-from PIL import Image
 
+from filming import film, look_from
 from jaxshape.data import meshes
 from jaxshape.data.boxes import Box
-from jaxshape.data.render import add_sensor_noise, render_depth
+from jaxshape.data.render import render_depth
 from jaxshape.data.sequences import open_sequence
 from jaxshape.files import write_json
 from jaxshape.geometry.camera import Intrinsics
@@ -197,18 +197,12 @@ def record(folder: Path, mesh: trimesh.Trimesh, frames: int, seed: int) -> Recor
     """Film a seat in its room, and write it in the 7-Scenes layout."""
     rng = np.random.default_rng(seed)
     T = _path(mesh.bounds, frames, rng)
-    poses = jaxlie.SE3.from_matrix(jnp.float32(T))
+    rows = (HEIGHT, WIDTH)
+    clean = film(folder, _in_a_room(mesh), T, rows, FOCAL, rng, T_WORLD_OBJECT @ T)
     lens = Intrinsics(*jnp.float32([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]))
-    depth, cosine = render_depth(_in_a_room(mesh), poses, lens, (HEIGHT, WIDTH))
-    alone, _ = render_depth(mesh, jaxlie.SE3(poses.wxyz_xyz[:1]), lens, (HEIGHT, WIDTH))
-    shown = np.isfinite(alone[0]) & (alone[0] < depth[0] + 1e-4)
-    depth = add_sensor_noise(depth, cosine, rng)
-    millimetres = np.where(np.isfinite(depth), np.rint(1000 * depth), 0).clip(0, 65534)
-    for i, image in enumerate(millimetres.astype(np.uint16)):
-        Image.fromarray(image).save(folder / f"frame-{i:06d}.depth.png")
-        np.savetxt(folder / f"frame-{i:06d}.pose.txt", T_WORLD_OBJECT @ T[i])
-    K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
-    np.savetxt(folder / "camera-intrinsics.txt", K)
+    first = jaxlie.SE3.from_matrix(jnp.float32(T[:1]))
+    alone, _ = render_depth(mesh, first, lens, rows)
+    shown = np.isfinite(alone[0]) & (alone[0] < clean[0] + 1e-4)
     row, column = np.nonzero(shown)
     middle = np.argmin(np.hypot(row - np.median(row), column - np.median(column)))
     click = float(column[middle]) + 0.5, float(row[middle]) + 0.5
@@ -246,16 +240,7 @@ def _path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarr
     target = np.stack([0 * along, bounds[0, 1] + height * (0.85 - 0.38 * away) - middle[1],
                        0 * along], axis=1)  # fmt: skip
     eye, target = eye + rng.normal(0, 0.01, eye.shape), target + rng.normal(0, 0.02, eye.shape)
-    return np.stack([_look_from(middle + a, middle + b) for a, b in zip(eye, target, strict=True)])
-
-
-def _look_from(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, (0, 1, 0))
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
-    return T
+    return np.stack([look_from(middle + a, middle + b) for a, b in zip(eye, target, strict=True)])
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 
 from jaxshape import limits
@@ -22,6 +22,10 @@ USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 
 _PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: what depth cameras reach, with room to spare
 _USUAL_MEDIAN_DEPTH = 2.0  # metres: an object in a room
+
+_INSTANCE, _NUMBERED = 1e-3, 0.95
+"""Share of an image that the pixels of an object fill at least, and share of the pixels of a mask
+that numbered objects fill together."""
 
 _CONFIDENT = 1  # of 0, 1 and 2, as ARKit rates its depths: 0 is a guess
 
@@ -58,6 +62,8 @@ class Frame(NamedTuple):
         intrinsics: Camera matrix of this frame `[3 3]`, in pixels.
         time: Time of the depth image from any start, in seconds; None where the recording does not
             tell.
+        instances: Number of the object that each pixel shows `[h w]`, 0 for none; None where the
+            mask does not number several objects.
     """
 
     name: str
@@ -67,6 +73,7 @@ class Frame(NamedTuple):
     mask: Bool[np.ndarray, "h w"] | None
     intrinsics: Float[np.ndarray, "3 3"]
     time: float | None = None
+    instances: Int[np.ndarray, "h w"] | None = None
 
 
 class FrameFiles(NamedTuple):
@@ -154,6 +161,7 @@ class Sequence:
             mask=None if files.mask is None else read_mask(files.mask, self.shape),
             intrinsics=self.camera_of(index),
             time=None if self.times is None else float(self.times[index]),
+            instances=None if files.mask is None else read_instances(files.mask, self.shape),
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -287,11 +295,30 @@ def read_color(path: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 
 
 def read_mask(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Read where an image is not black, scaled to `shape`; raises as `read_color` does."""
+    pixels = _mask_pixels(path, shape)
+    return pixels != 0 if pixels.ndim == 2 else (pixels != 0).any(axis=-1)
+
+
+def read_instances(path: Picture, shape: tuple[int, int]) -> Int[np.ndarray, "h w"] | None:
+    """Read the numbers of objects in a mask; None where it holds no more than one.
+
+    The rim of a mask that was scaled holds many values, none of them on many pixels.
+    """
+    pixels = _mask_pixels(path, shape)
+    if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
+        return None
+    values, counts = np.unique(pixels[pixels > 0], return_counts=True)
+    large = values[counts >= _INSTANCE * pixels.size]
+    if len(large) < 2 or counts[np.isin(values, large)].sum() < _NUMBERED * counts.sum():
+        return None
+    return np.where(np.isin(pixels, large), pixels, 0).astype(int)
+
+
+def _mask_pixels(path: Picture, shape: tuple[int, int]) -> np.ndarray:
     with opened(path) as image:
         _check_aspect(image, shape, path)
         opaque = image.convert("RGB") if image.mode in ("LA", "RGBA") else image
-        pixels = np.array(opaque.resize((shape[1], shape[0]), Image.Resampling.NEAREST))
-    return pixels != 0 if pixels.ndim == 2 else (pixels != 0).any(axis=-1)
+        return np.array(opaque.resize((shape[1], shape[0]), Image.Resampling.NEAREST))
 
 
 def _check_aspect(image: Image.Image, shape: tuple[int, int], path: Picture) -> None:

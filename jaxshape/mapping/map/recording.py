@@ -188,7 +188,7 @@ def advance(
         Member(
             one.parts,
             one.progress.state,
-            recut(prepared, one.progress) if frame.mask is None else None,
+            recut(prepared, one.progress),
             one.is_fused,
         )
         for one in followed
@@ -221,9 +221,10 @@ def _log(index: int, name: str, state: MapState, step: Step) -> FrameLog:
 def _belonging(prepared: PreparedFrame, progress: Progress) -> Cut | None:
     """How one object alone is cut out: by its box, and by the parts that belong to it.
 
-    A box that was given says what is the object; one that was found is not sure.
+    A mask, or a box that was given, says what is the object; a box that was found is not sure.
     """
-    if progress.start.T_level_world is None:
+    is_masked = not np.asarray(prepared.masked).all()
+    if progress.start.T_level_world is None or is_masked:
         return None
     return partial(cut_new, prepared, progress.state.keyframes, progress.state.place.cut)
 

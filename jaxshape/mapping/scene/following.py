@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool
 from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Sequence
 from jaxshape.geometry.grids import Grids
-from jaxshape.mapping.map.cutting import parts_in
 from jaxshape.mapping.map.mapper import placed_in
 from jaxshape.mapping.map.recording import Followed, FrameLog, Progress, advance, as_figures
 from jaxshape.mapping.map.several import Member, Parts, finish_all, refine_all
@@ -29,7 +28,7 @@ from jaxshape.mapping.map.state import grids_of
 from jaxshape.mapping.placement.finding import Start, first_readable, room
 from jaxshape.mapping.scene.boxing import boxed, fits, placed, turned_box
 from jaxshape.mapping.scene.classes import Decision, SceneClasses, decide, unfilled
-from jaxshape.mapping.scene.look import Look, look_around, shown
+from jaxshape.mapping.scene.look import Look, look_around, scene_parts, shown
 from jaxshape.mapping.scene.things import Thing, Told
 from jaxshape.mapping.scene.world import Level
 from jaxshape.mapping.tracking.keyframes import Cut, PreparedFrame, as_pose, prepare
@@ -119,7 +118,7 @@ def _begin(
     T = np.eye(4) if not use_poses else np.asarray(frame.T_world_camera, np.float64)
     ahead = np.eye(4)
     ahead[:3, 3] = T[:3, 3] + AHEAD * T[:3, 2]
-    found = parts_in(prepared, with_tables=False)
+    found = scene_parts(prepared)
     nothing = prepared._replace(masked=jnp.zeros_like(prepared.masked), parts=found)
     state, step = classes.unknown.init(
         nothing, Box(ahead, np.ones(3)), as_pose(T), poses_are_given=use_poses
@@ -156,7 +155,7 @@ def _recut(scene: Scene, looks: list[Look], prepared: PreparedFrame, progress: P
         if not looks:
             keyframes = scene.camera.state.keyframes
             looks.append(look_around(keyframes, (prepared, T), scene.level, scene.told))
-        return looks[0].parts, jnp.asarray(looks[0].pixels(number))
+        return looks[0].new.parts, jnp.asarray(looks[0].pixels(number))
 
     return cut
 

@@ -5,13 +5,23 @@ from typing import NamedTuple
 
 import jaxlie
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from jaxshape.mapping.map.cutting import parts_in
 from jaxshape.mapping.placement.faces import Cutout, world_points
 from jaxshape.mapping.placement.finding import rotation_onto_y
 from jaxshape.mapping.scene.things import Thing, Told, told_apart
-from jaxshape.mapping.scene.world import CELL, Level, above_floor, cells_of, clusters_of, keys_of
+from jaxshape.mapping.scene.world import (
+    CELL,
+    CHANGED,
+    LEAST_CELLS,
+    Level,
+    above_floor,
+    cells_met,
+    cells_of,
+    clusters_of,
+    keys_of,
+)
 from jaxshape.mapping.segmentation.parts import Parts
 from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame
 
@@ -19,18 +29,28 @@ SURE_FLOOR = 0.5
 """Evidence from which a level plane of a keyframe is the floor of the room."""
 
 
+class Shown(NamedTuple):
+    """A keyframe, and what it shows besides floor and walls.
+
+    Attributes:
+        view: The keyframe, with the pixels of all things.
+        parts: Its parts.
+    """
+
+    view: Cutout
+    parts: Parts
+
+
 class Look(NamedTuple):
     """What is seen of a scene once a keyframe is added.
 
     Attributes:
-        parts: Parts of the new keyframe.
-        view: The new keyframe, with the pixels of all things.
+        new: The new keyframe.
         level: The level frame; None before a floor was seen.
         told: The objects.
     """
 
-    parts: Parts
-    view: Cutout
+    new: Shown
     level: Level | None
     told: Told
 
@@ -42,19 +62,22 @@ class Look(NamedTuple):
         """
         thing = next((one for one in self.told.things if one.number == number), None)
         if thing is None:
-            return np.zeros(np.shape(self.view.depth), bool)
-        return self.pixels_in(thing, self.view)
+            return np.zeros(np.shape(self.new.view.depth), bool)
+        return self.pixels_in(thing, self.new)
 
-    def pixels_in(self, thing: Thing, view: Cutout) -> Bool[np.ndarray, "h w"]:
-        """The pixels of a keyframe whose points lie in or beside the cells of an object.
+    def pixels_in(self, thing: Thing, keyframe: Shown) -> Bool[np.ndarray, "h w"]:
+        """The pixels of a keyframe that show an object: those in its cells, or with its number.
 
         Args:
             thing: The object.
-            view: The keyframe, with the pixels of all things.
+            keyframe: The keyframe.
         """
+        view = keyframe.view
         found = np.array(view.segmented, bool)
         if self.level is None:
             return np.zeros_like(found)
+        if thing.is_numbered:
+            return found & keyframe.parts.are_numbered & (keyframe.parts.labels == thing.number)
         points = world_points(view)[found]
         R, t = self.level.T_level_world[:3, :3], self.level.T_level_world[:3, 3]
         points = points @ R.T + t
@@ -79,44 +102,85 @@ def look_around(
         told: The objects so far.
     """
     views = shown(keyframes)
-    if new is None:
-        parts, last = keyframes[-1].parts, views[-1]
-        assert parts is not None
-    else:
+    if new is not None:
         prepared, T = new
-        parts = parts_in(prepared, with_tables=False)
-        pose = np.asarray(T.as_matrix(), np.float64)
-        last = Cutout(prepared.view.depth, parts.labels != 0, prepared.view.intrinsics, pose)
-        views = [*views, last]
-    level = level or _level(last, parts)
+        parts, pose = scene_parts(prepared), np.asarray(T.as_matrix(), np.float64)
+        view = Cutout(prepared.view.depth, parts.labels != 0, prepared.view.intrinsics, pose)
+        views = [*views, Shown(view, parts)]
+    level = level or _level(views[-1])
     if level is not None:
-        told = told_apart(told, clusters_of(cells_of(views, level), level))
-    return Look(parts, last, level, told)
+        told = _told(views, level, told)
+    return Look(views[-1], level, told)
 
 
-def shown(keyframes: Sequence[Keyframe]) -> list[Cutout]:
+def scene_parts(prepared: PreparedFrame) -> Parts:
+    """The parts of a frame in which tables are objects; where a mask tells, those of the mask.
+
+    Args:
+        prepared: The frame.
+    """
+    parts = parts_in(prepared, with_tables=False)
+    if prepared.instances is not None:
+        return parts._replace(labels=prepared.instances, are_numbered=True)
+    return parts._replace(labels=np.where(np.asarray(prepared.masked), parts.labels, 0))
+
+
+def shown(keyframes: Sequence[Keyframe]) -> list[Shown]:
     """The keyframes of a scene, with the pixels of all that is neither floor nor wall.
 
     Args:
         keyframes: The keyframes, with their parts.
     """
-    return [
-        Cutout(
-            one.depth,
-            np.zeros(one.depth.shape, bool) if one.parts is None else one.parts.labels != 0,
-            one.intrinsics,
-            np.asarray(one.T_world_camera.as_matrix(), np.float64),
-        )
-        for one in keyframes
+    found = []
+    for one in keyframes:
+        assert one.parts is not None
+        T = np.asarray(one.T_world_camera.as_matrix(), np.float64)
+        view = Cutout(one.depth, one.parts.labels != 0, one.intrinsics, T)
+        found.append(Shown(view, one.parts))
+    return found
+
+
+def _told(views: Sequence[Shown], level: Level, told: Told) -> Told:
+    """The objects: those that masks number, or else the clusters of the room."""
+    if not any(one.parts.are_numbered for one in views):
+        cells = cells_of([one.view for one in views], level)
+        return told_apart(told, clusters_of(cells, level))
+    cells = cells_of([one.view for one in views], level)
+    changed = keys_of(cells.index[cells.is_changed])
+    found = [_numbered(n, views, level, changed) for n in _numbers(views)]
+    things = tuple(one for one in found if len(one.keys) >= LEAST_CELLS)
+    known = {one.number for one in told.things}
+    events = [f"Object {one.number} appeared." for one in things if one.number not in known]
+    return Told(things, (*told.events, *events), max((one.number for one in things), default=0))
+
+
+def _numbers(views: Sequence[Shown]) -> list[int]:
+    labels = [one.parts.labels for one in views if one.parts.are_numbered]
+    return [int(n) for n in np.unique(np.concatenate([one.ravel() for one in labels])) if n > 0]
+
+
+def _numbered(
+    number: int, views: Sequence[Shown], level: Level, changed: Int[np.ndarray, " n"]
+) -> Thing:
+    """The object of a number, and the cells that its pixels lie in."""
+    met = [
+        cells_met(one.view._replace(segmented=one.parts.labels == number), level)
+        for one in views
+        if one.parts.are_numbered
     ]
+    index = np.unique(np.concatenate(met), axis=0)
+    keys = np.sort(keys_of(index))
+    is_moved = bool(len(keys) and np.isin(keys, changed).mean() > CHANGED)
+    return Thing(number, keys, index, is_moved, False, True)
 
 
-def _level(view: Cutout, parts: Parts) -> Level | None:
+def _level(keyframe: Shown) -> Level | None:
     """The level frame of the floor that a keyframe shows; None where it shows none for sure."""
+    parts, T_world_camera = keyframe.parts, keyframe.view.T_world_camera
     if parts.evidence < SURE_FLOOR or not np.isfinite(parts.floor).all():
         return None
-    normal = view.T_world_camera[:3, :3] @ parts.floor[:3]
-    height = float(normal @ view.T_world_camera[:3, 3] - parts.floor[3])
+    normal = T_world_camera[:3, :3] @ parts.floor[:3]
+    height = float(normal @ T_world_camera[:3, 3] - parts.floor[3])
     T = np.eye(4)
     T[:3, :3] = rotation_onto_y(normal)
     return Level(T, height)

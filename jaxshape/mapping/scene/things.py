@@ -24,6 +24,7 @@ class Thing(NamedTuple):
         index: Indices of its cells `[n 3]`.
         is_moved: Whether it came or went while it was filmed.
         is_on_top: Whether it stands on a table.
+        is_numbered: Whether masks give its number, and its pixels.
     """
 
     number: int
@@ -31,6 +32,7 @@ class Thing(NamedTuple):
     index: Int[np.ndarray, "n 3"]
     is_moved: bool
     is_on_top: bool
+    is_numbered: bool = False
 
 
 class Told(NamedTuple):

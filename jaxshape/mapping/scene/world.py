@@ -101,7 +101,7 @@ def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
         views: Keyframes in their order, with the pixels that show neither floor nor wall.
         level: The level frame.
     """
-    met = [_met(view, level) for view in views]
+    met = [cells_met(view, level) for view in views]
     index = np.unique(np.concatenate([np.zeros((0, 3), int), *met]), axis=0)
     T_world_level = np.linalg.inv(level.T_level_world)
     centers = (index + 0.5) * CELL @ T_world_level[:3, :3].T + T_world_level[:3, 3]
@@ -111,8 +111,16 @@ def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
     return Cells(index, hit.sum(axis=0), passed.sum(axis=0), _changed(hit, passed))
 
 
-def _met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
-    """Cells that the marked pixels of a view lie in."""
+def cells_met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
+    """Cells that the marked pixels of a view lie in.
+
+    Args:
+        view: The view, with the pixels that count.
+        level: The level frame.
+
+    Returns:
+        Indices of the cells `[n 3]`.
+    """
     marked = np.asarray(view.segmented)
     points, z = world_points(view)[marked], np.asarray(view.depth, np.float64)[marked]
     R, t = level.T_level_world[:3, :3], level.T_level_world[:3, 3]

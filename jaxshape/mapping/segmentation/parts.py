@@ -30,6 +30,7 @@ class Parts(NamedTuple):
         floor: Normal of the floor, towards the camera, and the height of the camera above it in
             metres, in the frame of the camera `[4]`; NaN where no floor is seen.
         evidence: Evidence from this frame, from 0 to 1, that this is the floor.
+        are_numbered: Whether labels are numbers of objects, the same in all frames, from a mask.
     """
 
     labels: Int[np.ndarray, "h w"]
@@ -37,6 +38,7 @@ class Parts(NamedTuple):
     corners: Int[np.ndarray, " n"]
     floor: Float[np.ndarray, " 4"]
     evidence: float
+    are_numbered: bool = False
 
 
 def parts_of(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.data.boxes import Box, points_in_box
 from jaxshape.data.sequences import Frame
@@ -48,12 +48,15 @@ class PreparedFrame(NamedTuple):
         masked: Pixels that may show the object `[h w]`: a given mask, or all.
         recorded: The depth image in full size; None where that is the working size.
         parts: Parts that the image falls into; None where the box alone tells the object.
+        instances: Number of the object that each pixel shows `[h w]`, 0 for none; None where no
+            mask numbers them.
     """
 
     view: DepthView
     masked: Bool[Array, "h w"]
     recorded: DepthImage | None = None
     parts: Parts | None = None
+    instances: Int[np.ndarray, "h w"] | None = None
 
 
 # The parts of a frame, and the pixels that show the object, from the pose of the camera.
@@ -215,7 +218,11 @@ def prepare(frame: Frame, masked: Bool[np.ndarray, "h w"] | None = None) -> Prep
     mask = frame.mask if masked is None else masked
     shape = view.depth.shape
     may_show = jnp.ones(shape, bool) if mask is None else resized(mask, shape)
-    return PreparedFrame(view, may_show, image if halvings else None)
+    numbers = frame.instances
+    if numbers is not None:
+        step = numbers.shape[1] // shape[1]
+        numbers = numbers[step // 2 :: step, step // 2 :: step][: shape[0], : shape[1]]
+    return PreparedFrame(view, may_show, image if halvings else None, None, numbers)
 
 
 @partial(jax.jit, static_argnums=2)
