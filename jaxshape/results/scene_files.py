@@ -190,7 +190,8 @@ def scene_entries(
     told = [*figures.get("warnings", ()), *unreadable(scene.camera), *scene_warnings(scene)]
     return {
         **figures,
-        **counts(whole_progress(scene)),
+        **counts(scene.camera),
+        "keyframes": len(scene.camera.state.keyframes),
         "warnings": [*told, *warnings, *named],
         "objects": [_entry(one) for one in written],
         "moved": moved,
