@@ -18,8 +18,12 @@ from jaxshape.mapping.placement.faces import Cutout, world_points
 CELL = 0.03
 """Edge length of a cell, in metres: things closer than that are one cluster."""
 
-FLOOR_MARGIN = 0.025
+FLOOR_MARGIN = 0.03
 """Metres above the floor below which nothing is a thing, on top of the noise of depth."""
+
+LOW = 0.1
+"""Metres above the floor below which cells do not join clusters: floors are uneven, poses err, and
+a keyframe that shows little floor takes it for a thing."""
 
 THROUGH = 0.05
 """Metres behind a cell from which a depth says that the cell is free, on top of its noise."""
@@ -194,7 +198,12 @@ def clusters_of(cells: Cells, level: Level) -> list[Cluster]:
     """
     kept = (cells.through <= cells.hits) | cells.is_changed
     floor = level.floor / CELL
-    found = [one for part in _connected(cells.index[kept]) for one in _off_the_table(part, floor)]
+    index, hits = cells.index[kept], cells.hits[kept]
+    is_low = (index[:, 1] - floor) * CELL < LOW
+    parts = [
+        _with_feet(part, index[is_low], floor) for part in _apart(index[~is_low], hits[~is_low])
+    ]
+    found = [one for part in parts for one in _off_the_table(part, floor)]
     joined = _joined([one for one, top in found if not top])
     things = [(one, False) for one in joined] + [(one, True) for one, top in found if top]
     changed = keys_of(cells.index[cells.is_changed])
@@ -206,6 +215,36 @@ def clusters_of(cells: Cells, level: Level) -> list[Cluster]:
         ),
         key=lambda cluster: -len(cluster.index),
     )
+
+
+def _apart(
+    index: Int[np.ndarray, "n 3"], hits: Int[np.ndarray, " n"], least: int = 1
+) -> list[Int[np.ndarray, "_ 3"]]:
+    """Clusters of cells; what is too large for an object is cut where few keyframes saw it.
+
+    Bridges between things are made by noise, and seen by one keyframe or two.
+    """
+    kept = hits >= least
+    found, of_cell = [], dict(zip(keys_of(index).tolist(), hits.tolist(), strict=True))
+    for part in _connected(index[kept]):
+        own = np.array([of_cell[key] for key in keys_of(part).tolist()])
+        if _is_too_large(part) and own.max() > least:
+            found += _apart(part, own, least + 1)
+        else:
+            found.append(part)
+    return found
+
+
+def _with_feet(
+    part: Int[np.ndarray, "n 3"], low: Int[np.ndarray, "m 3"], floor: float
+) -> Int[np.ndarray, "_ 3"]:
+    """A cluster with the cells near the floor that lie under its own lowest ones."""
+    near = part[(part[:, 1] - floor) * CELL < 2 * LOW]
+    if not len(near) or not len(low):
+        return part
+    around = [near * (1, 0, 1) + (i, 0, k) for i in (-1, 0, 1) for k in (-1, 0, 1)]
+    own = np.isin(keys_of(low * (1, 0, 1)), keys_of(np.concatenate(around)))
+    return np.concatenate([part, low[own]])
 
 
 def _connected(index: Int[np.ndarray, "n 3"]) -> list[Int[np.ndarray, "_ 3"]]:
@@ -273,9 +312,13 @@ def _is_fragment(part: Int[np.ndarray, "n 3"], whole: Int[np.ndarray, "m 3"]) ->
 
 
 def _is_furniture(index: Int[np.ndarray, "n 3"]) -> bool:
+    is_high = np.ptp(index[:, 1]) + 1 > LEAST_HEIGHT / CELL
+    return bool(len(index) >= LEAST_CELLS and is_high and not _is_too_large(index))
+
+
+def _is_too_large(index: Int[np.ndarray, "n 3"]) -> bool:
     size = (np.ptp(index, axis=0) + 1) * CELL
-    along = np.hypot(size[0], size[2])
-    return bool(len(index) >= LEAST_CELLS and along < LONGEST and LEAST_HEIGHT < size[1] < TALLEST)
+    return bool(np.hypot(size[0], size[2]) > LONGEST or size[1] > TALLEST)
 
 
 def _stands(index: Int[np.ndarray, "n 3"], floor: float) -> bool:
