@@ -7,11 +7,10 @@ on, and things of neither class. A Kinect's noise, 320 x 240 pixels; given poses
 degrees. An object is found where its box overlaps the true one by a quarter. IoU is that of the
 mesh's voxels and the true ones, at 32 along each side of the true box.
 
-Results: experiments/results/rooms.json, room by room: a run that was killed goes on.
+Results: experiments/results/rooms.json, room by room, and rooms.png: a run that was killed goes on.
 """
 
 import json
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -36,6 +35,8 @@ from jaxshape.mapping.scene.classes import SceneClasses, build_classes
 from jaxshape.mapping.scene.following import Scene, SceneObject, finish_scene, follow_scene
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
+from jaxshape.report.figures import save_figure
+from jaxshape.report.palette import CYCLE
 from jaxshape.results.output import only, shape_mesh
 from jaxshape.results.progress import observation_of
 from things import KINDS, thing
@@ -88,6 +89,7 @@ def run(config: Config) -> dict[str, Any]:
             done[str(number)] = one_room(number, config.frames, classes)
             content = {"settings": settings, "summary": summary(done), "rooms": done}
             write_json(path, content)
+            draw(done, config.results / "rooms.png")
             print(number, json.dumps(done[str(number)]), flush=True)
     return {"settings": settings, "summary": summary(done), "rooms": done}
 
@@ -323,6 +325,35 @@ def _errors(kind: str, right: list[dict[str, Any]]) -> dict[str, float]:
     }
 
 
+def draw(rooms: dict[str, Any], path: Path) -> None:
+    """What each kind was taken for, and the IoU of those that were found."""
+    objects = [one for room in rooms.values() for one in room["objects"]]
+    kinds, classes = ["chair", "table", *KINDS], ["chair", "table", "None", "not found"]
+    counts = np.zeros((len(kinds), len(classes)), int)
+    for one in objects:
+        answer = str(one.get("class")) if one["found"] else "not found"
+        counts[kinds.index(one["kind"]), classes.index(answer)] += 1
+
+    def plot(figure: Any) -> None:
+        left, right = figure.subplots(1, 2)
+        left.imshow(counts, cmap="Blues", aspect="auto", vmax=2 * max(counts.max(), 1))
+        left.set_xticks(range(len(classes)), ["chair", "table", "of no class", "not found"])
+        for (i, j), count in np.ndenumerate(counts):
+            left.text(j, i, str(count) if count else "", ha="center", va="center")
+        left.set_title(
+            f"{len(objects)} objects of {len(rooms)} rooms, and what they were taken for"
+        )
+        for i, kind in enumerate(kinds):
+            values = [one["iou"] for one in objects if one["kind"] == kind and "iou" in one]
+            right.plot(values, [i] * len(values), "o", color=CYCLE[0], alpha=0.6)
+        right.set_ylim(len(kinds) - 0.5, -0.5)
+        right.set_xlim(0, 1)
+        right.set_title("IoU with the true surface, in its box")
+        for axes in (left, right):
+            axes.set_yticks(range(len(kinds)), kinds)
+
+    save_figure(path, (9.6, 3.6), plot)
+
+
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parent))
     main(tyro.cli(Config))

@@ -66,14 +66,12 @@ class Scene(NamedTuple):
         objects: The objects, in the order of their numbers.
         level: The level frame; None before a floor was seen.
         told: What appeared, was joined, parted and moved.
-        warnings: What a user should look at, in sentences.
     """
 
     camera: Progress
     objects: tuple[SceneObject, ...]
     level: Level | None
     told: Told
-    warnings: tuple[str, ...] = ()
 
     @property
     def logs(self) -> tuple[FrameLog, ...]:
@@ -174,7 +172,7 @@ def _with_look(scene: Scene, look: Look, classes: SceneClasses) -> Scene:
     known = {one.thing.number: one for one in scene.objects}
     scene = scene._replace(level=look.level, told=look.told)
     changed, objects = [], []
-    for thing in look.told.things:
+    for thing in sorted(look.told.things, key=lambda one: one.number):
         if thing.is_moved:
             continue
         before = known.get(thing.number)
@@ -254,15 +252,14 @@ def finish_scene(scene: Scene, classes: SceneClasses) -> Scene:
     """
     objects = [_placed_by_class(one, classes) for one in _decided(scene.objects, classes)]
     members = [Member(_parts(one, classes), one.progress.state) for one in objects]
-    if not members:
-        return scene
-    states, shapes = finish_all(members)
+    carrier = Member(classes.unknown.parts, scene.camera.state, is_fused=False)
+    (camera, *states), (_, *shapes) = finish_all([carrier, *members])
     finished = []
     for one, state, shape in zip(objects, states, shapes, strict=True):
         if shape is None:
             shape = unfilled(grids_of(state), state.code)
         finished.append(one._replace(progress=one.progress._replace(state=state, shape=shape)))
-    return scene._replace(objects=tuple(finished))
+    return scene._replace(camera=scene.camera._replace(state=camera), objects=tuple(finished))
 
 
 def _decided(objects: tuple[SceneObject, ...], classes: SceneClasses) -> list[SceneObject]:
