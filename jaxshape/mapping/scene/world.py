@@ -112,7 +112,22 @@ def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
     key = keys_of(index)
     hit = np.array([np.isin(key, keys_of(one)) for one in met]).reshape(len(views), -1)
     passed = np.array([_seen_through(centers, view) for view in views]).reshape(hit.shape) & ~hit
-    return Cells(index, hit.sum(axis=0), passed.sum(axis=0), _changed(hit, passed))
+    # A thin thing is met beside its cells where poses err, and is not gone.
+    near = np.array([_beside(index, one) for one in met]).reshape(hit.shape)
+    return Cells(index, hit.sum(axis=0), passed.sum(axis=0), _changed(near, passed & ~near))
+
+
+def _beside(
+    index: Int[np.ndarray, "n 3"], met: Int[np.ndarray, "m 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Cells that are among some others or touch them."""
+    if not len(met):
+        return np.zeros(len(index), bool)
+    low = index.min(axis=0)
+    grid = np.zeros(index.max(axis=0) - low + 1, bool)
+    grid[tuple((met - low).T)] = True
+    grown = np.asarray(ndimage.binary_dilation(grid, np.ones((3, 3, 3))), bool)
+    return grown[tuple((index - low).T)]
 
 
 def cells_met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:

@@ -14,6 +14,7 @@ from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import build_mapper
 from jaxshape.mapping.map.recording import Followed, advance, follow
 from jaxshape.mapping.placement.finding import find_start
+from jaxshape.mapping.placement.placing import PlacementConfig
 from jaxshape.mapping.scene.classes import build_classes
 from jaxshape.mapping.scene.following import finish_scene, follow_scene
 from jaxshape.mapping.segmentation.segment import Prompt
@@ -52,8 +53,11 @@ def record(folder, *shown):
 
 
 @pytest.fixture(scope="module")
-def classes(priors):
-    return build_classes(priors, mapping=MAPPING)
+def classes(priors, compile_quickly):
+    """With a short search of the boxes: the cells tell where they are."""
+    found = build_classes(priors, mapping=MAPPING)
+    short = PlacementConfig(yaws=4, overhangs=(0.0,), kept=1, steps=2, steps_again=2)
+    return found._replace(known=tuple(one._replace(sizes=short) for one in found.known))
 
 
 @pytest.fixture(scope="module")
