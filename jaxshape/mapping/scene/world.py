@@ -117,9 +117,7 @@ def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
     return Cells(index, hit.sum(axis=0), passed.sum(axis=0), _changed(near, passed & ~near))
 
 
-def _beside(
-    index: Int[np.ndarray, "n 3"], met: Int[np.ndarray, "m 3"]
-) -> Bool[np.ndarray, " n"]:
+def _beside(index: Int[np.ndarray, "n 3"], met: Int[np.ndarray, "m 3"]) -> Bool[np.ndarray, " n"]:
     """Cells that are among some others or touch them."""
     if not len(met):
         return np.zeros(len(index), bool)
