@@ -423,3 +423,21 @@ def test_without_webgl_there_is_a_picture(folder):
         tab.wait_for_timeout(200)
         assert tab.locator("#shape.live").count() == 0
         assert np.ptp(shown(tab.locator("#shape img"))) > 100
+
+
+def test_the_report_of_a_scene_lists_its_objects(tmp_path):
+    entry = {
+        "name": "chair-1",
+        "class": "chair",
+        "sure": 0.987,
+        "size": [0.5, 0.9, 0.55],
+        "verdict": "doubtful",
+        "verdict_reasons": ["<b>"],
+    }
+    other = entry | {"name": "object-2", "class": None}
+    content = {"objects": [entry, other], "events": ["Object 1 appeared."]}
+    (tmp_path / "scene.json").write_text(json.dumps(content))
+    text = write_report(tmp_path).read_text()
+    assert "<td>chair-1</td><td>chair</td><td>99 %</td><td>0.50 × 0.90 × 0.55 m</td>" in text
+    assert "<td>object-2</td><td>none</td>" in text
+    assert "doubtful: &lt;b&gt;" in text and "<li>Object 1 appeared.</li>" in text

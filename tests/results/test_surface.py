@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.results.glb import Node, write_glb
 from jaxshape.results.surface import read_ply, surface, voxel_surface, write_mesh
 
 UNIT = GridFrame(np.zeros(3), np.ones(3))
@@ -222,3 +223,21 @@ def test_a_ply_of_no_surface_is_refused(tmp_path, damage):
     trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "bad.ply")
     with pytest.raises(ValueError):
         read_ply(tmp_path / "bad.ply")
+
+
+def test_a_glb_of_several_objects_has_a_node_for_each(tmp_path):
+    T = np.eye(4)
+    T[:3, 3] = 1, 2, 3
+    boxes = [trimesh.creation.box((1, 1, 1)), trimesh.creation.box((2, 2, 2))]
+    nodes = [
+        Node("chair-1", boxes[0], T_world_object=T, extras={"class": "chair", "sure": 0.9}),
+        Node("object-2", boxes[1]),
+    ]
+    write_glb(tmp_path / "scene.glb", nodes)
+    read = trimesh.load_scene(tmp_path / "scene.glb")
+    placed, name = read.graph["chair-1"]
+    np.testing.assert_allclose(placed, T)
+    np.testing.assert_allclose(read.geometry[name].extents, 1)
+    np.testing.assert_allclose(read.geometry[read.graph["object-2"][1]].extents, 2)
+    content = (tmp_path / "scene.glb").read_bytes()
+    assert b'"sure":0.9' in content and b'"class":"chair"' in content

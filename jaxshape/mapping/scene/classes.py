@@ -155,7 +155,7 @@ def build_classes(
 MARGIN, SPREAD = 0.14, 0.025
 """Evidence, in nats per hidden surface voxel, from which an object is of a class, and the width
 over which the answer goes from unlikely to likely. Of 40 procedural chairs 31 have more, and the
-others, stools and poufs without a front, at most 0.05; of 40 tables 2 have more, of 80 things of
+others, most of them stools without a back, at most 0.05; of 40 tables 2 have more, of 80 things of
 neither class only balls and a plant, which `WORST` excludes."""
 
 OPPOSITE = 0.5
