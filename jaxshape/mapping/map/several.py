@@ -187,10 +187,11 @@ def refine_all(
         for i, one in enumerate(members)
         if one.is_fused and one.parts.is_searched
     }
-    classes: dict[int, list[int]] = {}
+    # Classes may share a search: it is the prior that tells them apart.
+    classes: dict[tuple[int, int], list[int]] = {}
     for i, one in enumerate(members):
         if i in grids and bool(binary(grids[i]).occupied.any()):
-            classes.setdefault(id(one.parts.run_long), []).append(i)
+            classes.setdefault((id(one.parts.prior), id(one.parts.run_long)), []).append(i)
     for rows in classes.values():
         parts = members[rows[0]].parts
         run = parts.run_long if is_long else parts.run_short
