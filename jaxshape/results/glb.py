@@ -46,8 +46,8 @@ def write_glb(path: str | os.PathLike[str], nodes: Sequence[Node]) -> None:
     for node in nodes:
         T = np.eye(4) if node.T_world_object is None else node.T_world_object
         scene.add_geometry(_flagged(node), geom_name=node.name, node_name=node.name, transform=T)
-        if node.extras:
-            scene.graph.update(node.name, geometry=node.name, matrix=T, metadata=node.extras)
+
+    known = {node.name: node.extras for node in nodes}
 
     def finish(tree: dict[str, Any]) -> None:
         for mesh in tree["meshes"]:
@@ -55,6 +55,9 @@ def write_glb(path: str | os.PathLike[str], nodes: Sequence[Node]) -> None:
                 part["material"] = 0
                 if "_COLOR_0" in part["attributes"]:
                     part["attributes"]["COLOR_0"] = part["attributes"].pop("_COLOR_0")
+        for entry in tree["nodes"]:
+            if extras := known.get(entry.get("name")):
+                entry["extras"] = extras
         dull = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
         tree["materials"] = [{"pbrMetallicRoughness": dull, "doubleSided": True}]
 
