@@ -38,6 +38,11 @@ AHEAD = 1.5
 """
 
 
+VIEWS, LITTLE = 2, 0.05
+"""Keyframes that must show an object for its class to be decided, and the share of the pixels of
+the fullest one from which a keyframe shows it."""
+
+
 class SceneObject(NamedTuple):
     """An object of a scene.
 
@@ -271,7 +276,16 @@ def _decided(objects: tuple[SceneObject, ...], classes: SceneClasses) -> list[Sc
         jnp.stack([one.occupied for one in grids]), jnp.stack([one.occluded for one in grids])
     )
     decisions = decide({one.name: one.prior for one in classes.known}, stacked)
-    return [one._replace(decision=d) for one, d in zip(objects, decisions, strict=True)]
+    return [
+        one._replace(decision=d if _is_seen_well(one) else d._replace(name=None, quarters=0))
+        for one, d in zip(objects, decisions, strict=True)
+    ]
+
+
+def _is_seen_well(one: SceneObject) -> bool:
+    """Whether several keyframes show an object: a fragment seen once may look like anything."""
+    counts = np.array([int(k.segmented.sum()) for k in one.progress.state.keyframes])
+    return int((counts > LITTLE * counts.max(initial=1)).sum()) >= VIEWS
 
 
 def _placed_by_class(one: SceneObject, classes: SceneClasses) -> SceneObject:
