@@ -39,6 +39,8 @@ from .mapping.scene.classes import Decision, SceneClasses, build_classes
 from .mapping.scene.following import Scene, SceneObject, finish_scene, follow_scene
 from .mapping.segmentation.segment import Prompt, Segmentation, segment
 from .mapping.tracking.keyframes import PreparedFrame
+from .mapping.views.candidates import reachable_views
+from .mapping.views.gain import NextViews, next_views
 from .model.calibration import Calibration
 from .model.config import Architecture
 from .model.shapes import Prepared, ShapeModel, ShapePrior, decode, decode_prepared, encode
@@ -127,6 +129,7 @@ __all__ = [
     "Measurement",
     "MeshSource",
     "Model",
+    "NextViews",
     "PAPER",
     "Pinhole",
     "Placement",
@@ -209,6 +212,7 @@ __all__ = [
     "measure_frames",
     "merge",
     "merge_all",
+    "next_views",
     "objective",
     "occluded",
     "occupied",
@@ -221,6 +225,7 @@ __all__ = [
     "random_table",
     "random_views",
     "raw",
+    "reachable_views",
     "read_meshes",
     "read_trajectory",
     "reconstruct",

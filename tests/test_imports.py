@@ -19,7 +19,7 @@ ALONE = ("limits",)
 BELOW_ALL = (*ALONE, "checks", "reading", "files", "process", "claim")
 
 PACKAGES = ("geometry", "data", "model", "search", "mapping", "results", "report", "bench", "cli")
-ROOMS = ("config", "segmentation", "tracking", "placement", "map", "scene")
+ROOMS = ("config", "segmentation", "tracking", "placement", "map", "scene", "views")
 """Each imports from itself and from those before it."""
 
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

@@ -10,6 +10,7 @@ that `--help` answers at once.
     scene      scene
     completing complete
     inspecting inspect
+    looking    next
     learning   dataset, train
     scoring    evaluate, plot
     benchmarking bench
@@ -37,6 +38,7 @@ from jaxshape.cli.completing import Complete
 from jaxshape.cli.doctor import Doctor
 from jaxshape.cli.inspecting import Inspect
 from jaxshape.cli.learning import BuildDataset, Train, preset_in
+from jaxshape.cli.looking import NextView
 from jaxshape.cli.options import RefusedSetting, refusing, reworded
 from jaxshape.cli.rebuild import Demo
 from jaxshape.cli.recording import Reconstruct
@@ -62,6 +64,7 @@ def commands(arguments: Sequence[str]) -> Any:
         | Annotated[BuildScene, subcommand("scene")]
         | Annotated[Complete, subcommand("complete")]
         | Annotated[Inspect, subcommand("inspect")]
+        | Annotated[NextView, subcommand("next")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Plot, subcommand("plot")]
         | Annotated[Bench, subcommand("bench")]

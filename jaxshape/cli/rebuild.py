@@ -48,10 +48,10 @@ class Rebuild:
 
     def prepare(self, family: FamilyName = "chair") -> tuple[Any, Any, RefineConfig]:
         """The prior, the search and its settings, so that bad options are refused before work."""
-        from jaxshape.model.weights import load_prior, packaged_for
+        from jaxshape.model.weights import load_prior
         from jaxshape.search.reconstruction import refiner_for
 
-        prior = load_prior(self.weights or packaged_for(family))
+        prior = load_prior(self.weights_for(family))
         return prior, refiner_for(self.method_for(prior), prior, self.search), self.search
 
     def placer(self, prior: Any) -> Any:
@@ -71,11 +71,21 @@ class Rebuild:
 
         return self.method or usual_method(prior)
 
-    def settings(self, prior: Any, fusion: FusionName) -> dict[str, Any]:
+    def weights_for(self, family: FamilyName = "chair") -> str:
+        """The weights file that was asked for, or the name of the package's for a family."""
+        from jaxshape.model.weights import packaged_for
+
+        return str(self.weights) if self.weights else packaged_for(family)
+
+    def settings(
+        self, prior: Any, fusion: FusionName, family: FamilyName = "chair"
+    ) -> dict[str, Any]:
         """Settings of the search for result.json, of grids that are fused in this way."""
         objective = self.search.objective or objective_for(fusion)
         search = asdict(self.search) | {"objective": objective}
-        return {"method": self.method_for(prior), "seed": self.seed, "search": search}
+        weights = self.weights_for(family)
+        settings = {"method": self.method_for(prior), "seed": self.seed, "search": search}
+        return settings | {"weights": weights}
 
     def searched(self, prior: Any, refiner: Any, config: RefineConfig, grids: Any) -> Any:
         """The `Reconstruction` of one object, a batch of one, from its F and M (`Grids`)."""
@@ -163,7 +173,7 @@ class Demo(Rebuild):
         found = self.searched(prior, refiner, config, grids)
         figures = {"object": f"procedural {self.family} {shown.seed}", "frames": self.frames}
         figures |= {"camera": seen.camera, "noise": seen.is_noisy, "fusion": seen.fused_by}
-        figures |= self.settings(prior, seen.fused_by)
+        figures |= self.settings(prior, seen.fused_by, self.family)
         figures |= {"seconds": round(time.perf_counter() - start, 2)}
         result = written(self.output, observation, found, figures)
         report_objective(result)
@@ -206,5 +216,6 @@ class Demo(Rebuild):
             T_world_object=np.eye(4),
             truth=np.asarray(captured.surface),
             field=state if seen.fused_by == "distance" else None,
+            soft=grids if seen.fused_by == "distance" else None,
             sensor=sensor,
         )

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.distance import DistanceField
 from jaxshape.geometry.grid import GridFrame
+from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.geometry.pixels import Sensor
 from jaxshape.mapping.map.doubts import ALL_SEEN, Unseen
@@ -50,6 +51,8 @@ class Observation(NamedTuple):
         keyframes: The keyframes that the mesh is judged by; none leave it unjudged.
         floor: Height of the floor in the object frame, in metres; NaN where it is not known.
         unseen: What no keyframe saw of the object.
+        soft: F and M as the prior took them, which `occupied` and `occluded` round; None for binary
+            ones.
         cloud: Points in the object frame that the mesh is judged by where there are no keyframes
             `[n 3]`, in metres; None leaves it unjudged.
     """
@@ -66,6 +69,7 @@ class Observation(NamedTuple):
     keyframes: Sequence[SeenView] = ()
     floor: float = np.nan
     unseen: Unseen = ALL_SEEN
+    soft: Grids | None = None
     cloud: Float[np.ndarray, "n 3"] | None = None
 
 
@@ -288,6 +292,8 @@ def _write_grids(path: Path, observation: Observation, one: Any) -> None:
     if one.samples is not None:
         arrays["samples"] = one.samples > 0
         arrays["probability"] = one.probability.astype(np.float16)
+    if observation.soft is not None:
+        arrays["F"], arrays["M"] = (np.float16(x) for x in observation.soft[:2])
     if observation.truth is not None:
         arrays["truth"] = observation.truth
     with atomic_path(path) as temporary:

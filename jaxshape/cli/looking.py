@@ -1,0 +1,91 @@
+"""`jaxshape next`: from where an object should be filmed next."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from jaxshape import checks
+from jaxshape.claim import Output
+from jaxshape.cli.common import console, require
+
+
+@dataclass(frozen=True)
+class NextView:
+    """Say from where to film an object next: the views that would tell most of what is hidden.
+
+    Left and right are the object's own, as of someone who sits on the chair.
+
+    Example: jaxshape next out/reconstruct
+    """
+
+    result: Positional[Path]
+    """Finished folder made by `jaxshape reconstruct` or `jaxshape demo`."""
+    distance: float | None = None
+    """Distance of the camera from the object's centre, in metres; as it was filmed by default."""
+    weights: Path | None = None
+    """Weights that the result was made with; those that it names by default."""
+    samples: int = 16
+    """Plausible shapes by which views are chosen, 1 to 32."""
+    seed: int = 0
+    """Seed of these shapes, 0 or more."""
+
+    def __post_init__(self) -> None:
+        checks.seed("seed", self.seed)
+        checks.whole("samples", self.samples, 1, 32)
+        if self.distance is not None:
+            checks.positive("distance", self.distance, "metres")
+
+    @property
+    def writes(self) -> Output:
+        """What is written."""
+        return Output(self.result, goes_on=True)
+
+    def run(self) -> None:
+        require(
+            (self.result / "grid.npz").is_file(),
+            f"{str(self.result)!r} holds no grid.npz; give a finished folder of jaxshape "
+            "reconstruct or demo.",
+        )
+        from jaxshape.files import write_json
+        from jaxshape.model.weights import load_prior
+        from jaxshape.report.next_views import write_next_views
+        from jaxshape.results.folder import read_folder
+        from jaxshape.results.looking import look
+
+        named = read_folder(self.result).result.get("weights")
+        prior = load_prior(self.weights or (named if isinstance(named, str) else None))
+        with console.status("looking around the object"):
+            looked = look(
+                self.result,
+                prior,
+                distance=self.distance,
+                samples=self.samples,
+                seed=self.seed,
+            )
+            write_next_views(self.result / "next_views.png", looked)
+        write_json(self.result / "next.json", as_json(looked))
+        for number, view in enumerate(as_json(looked)["views"], 1):
+            print(f"{number}: {view['where']}: {view['share']:.0%} of what is uncertain")
+        print(f"wrote next_views.png and next.json to {self.result}")
+
+
+def as_json(looked: Any) -> dict[str, Any]:
+    """The best views; lengths in metres, entropy in nats, poses in the object frame."""
+    import numpy as np
+
+    views, entropy = looked.views, float(looked.views.entropy)
+    poses = np.asarray(views.T_object_camera.as_matrix())
+    return {
+        "entropy": round(entropy, 1),
+        "views": [
+            {
+                "where": where,
+                "gain": round(float(views.gain[i]), 1),
+                "share": round(float(views.gain[i]) / max(entropy, 1e-9), 4),
+                "T_object_camera": np.round(poses[i], 5).tolist(),
+            }
+            for i, where in zip(looked.best, looked.sentences(), strict=True)
+        ],
+    }
