@@ -73,7 +73,7 @@ def next_views(
         grids: F and M of the object `[x y z]`, binary or soft.
         frame: Voxel frame of the grids.
         T_object_camera: Poses of the cameras to choose from, outside the object's box `[view]`.
-        intrinsics: The camera.
+        intrinsics: Focal lengths and principal point of the cameras, in pixels.
         shape: Height and width of its images, in pixels.
         here: Where the camera is now, in the object frame `[3]`, in metres; nearby cameras come
             first where gains are about the same. None where that does not matter.
