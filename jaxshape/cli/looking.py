@@ -24,16 +24,8 @@ class NextView:
     """Finished folder made by `jaxshape reconstruct` or `jaxshape demo`."""
     distance: float | None = None
     """Distance of the camera from the object's centre, in metres; as it was filmed by default."""
-    weights: Path | None = None
-    """Weights that the result was made with; those that it names by default."""
-    samples: int = 16
-    """Plausible shapes by which views are chosen, 1 to 32."""
-    seed: int = 0
-    """Seed of these shapes, 0 or more."""
 
     def __post_init__(self) -> None:
-        checks.seed("seed", self.seed)
-        checks.whole("samples", self.samples, 1, 32)
         if self.distance is not None:
             checks.positive("distance", self.distance, "metres")
 
@@ -49,21 +41,11 @@ class NextView:
             "reconstruct or demo.",
         )
         from jaxshape.files import write_json
-        from jaxshape.model.weights import load_prior
         from jaxshape.report.next_views import write_next_views
-        from jaxshape.results.folder import read_folder
         from jaxshape.results.looking import look
 
-        named = read_folder(self.result).result.get("weights")
-        prior = load_prior(self.weights or (named if isinstance(named, str) else None))
         with console.status("looking around the object"):
-            looked = look(
-                self.result,
-                prior,
-                distance=self.distance,
-                samples=self.samples,
-                seed=self.seed,
-            )
+            looked = look(self.result, distance=self.distance)
             write_next_views(self.result / "next_views.png", looked)
         write_json(self.result / "next.json", as_json(looked))
         for number, view in enumerate(as_json(looked)["views"], 1):

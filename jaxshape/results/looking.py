@@ -1,17 +1,14 @@
 """Where to look next at the object of a result folder. [host]
 
-Samples of the shape are codes of the prior: of a conditional prior around the most probable code,
-of others around the code that was found, as far as the training codes spread.
+The folder holds samples of the posterior, so that choosing a view decodes nothing.
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxshape import reading
 from jaxshape.data.virtual_cameras import CAMERAS
@@ -20,12 +17,8 @@ from jaxshape.geometry.grid import GridFrame
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
 from jaxshape.mapping.views.candidates import in_words, reachable_views
-from jaxshape.mapping.views.gain import NextViews, next_views
-from jaxshape.model.shapes import ShapePrior, decode
+from jaxshape.mapping.views.gain import MOST_SHAPES, NextViews, next_views
 from jaxshape.results.folder import ResultFolder, camera_poses, extent, read_folder
-
-SAMPLES = 16
-"""Plausible shapes by which views are chosen."""
 
 BEST = 3
 """Views that are named."""
@@ -55,29 +48,19 @@ class Looked(NamedTuple):
         return [in_words(eyes[i], self.floor) for i in self.best]
 
 
-def look(
-    folder: Path,
-    prior: ShapePrior,
-    *,
-    distance: float | None = None,
-    samples: int = SAMPLES,
-    seed: int = 0,
-) -> Looked:
+def look(folder: Path, *, distance: float | None = None) -> Looked:
     """The views that would tell most about the object of a result folder. [host]
 
     Args:
         folder: Folder made by `reconstruct` or `demo`.
-        prior: The shape prior that it was made with.
-        distance: Of the cameras from the object's centre, in metres; None for that at which it was
-            filmed, or where a Kinect stands.
-        samples: Plausible shapes, 1 to 32.
-        seed: Seed of their codes, 0 or more.
+        distance: Distance of the cameras from the object's centre, in metres; None for that at
+            which it was filmed, or where a Kinect stands.
 
     Raises:
-        ValueError: The folder holds no finished grids, or grids of another prior.
+        ValueError: The folder holds no finished grids, or no samples.
     """
     found = read_folder(folder)
-    kept = _kept(folder / "grid.npz", prior)
+    kept = _kept(folder / "grid.npz")
     grids = Grids(kept["F"], kept["M"])
     frame = GridFrame(jnp.float32(found.origin), jnp.float32(found.voxel_size))
     poses = [T for _, T in camera_poses(found)]
@@ -91,53 +74,27 @@ def look(
         )
     T = reachable_views(radius, floor)
     here = jnp.float32(poses[-1][:3, 3]) if poses else None
-    logits = drawn(prior, jax.random.key(seed), grids, jnp.float32(kept["code"]), samples)
     sensor = Sensor(axial=_noise(found))
-    views = _choose(logits, grids, frame, T, intrinsics, shape, here=here, sensor=sensor)
+    samples = jnp.float32(kept["samples"][:MOST_SHAPES])
+    views = _choose(samples, grids, frame, T, intrinsics, shape, here=here, sensor=sensor)
     return Looked(found, jax.device_get(views), _apart(views), floor)
-
-
-@partial(jax.jit, static_argnums=4)
-def drawn(
-    prior: ShapePrior, key: Array, grids: Grids, code: Float[Array, " d"], count: int
-) -> Float[Array, "sample x y z"]:
-    """Logits of plausible shapes of one object.
-
-    Args:
-        prior: The shape prior.
-        key: Random key of the codes.
-        grids: F and M of the object `[x y z]`.
-        code: The code that was found `[d]`.
-        count: Shapes, 1 or more.
-    """
-    spread = jax.random.multivariate_normal(
-        key, jnp.zeros_like(code), prior.code_covariance, (1, count), method="svd"
-    )
-    return decode(prior, code + spread, jax.tree.map(lambda x: x[None], grids))[0]
 
 
 _choose = jax.jit(next_views, static_argnames=("shape", "sensor"))
 
 
-def _kept(path: Path, prior: ShapePrior) -> dict[str, np.ndarray]:
-    """F, M and the code; of results of earlier versions, F and M are binary."""
-    names = ("F", "M", "occupied", "occluded", "code")
+def _kept(path: Path) -> dict[str, np.ndarray]:
+    """F, M and the samples; F and M are binary where frames were fused as points."""
+    names = ("F", "M", "occupied", "occluded", "samples")
     kept = reading.read_arrays(path, names) if path.is_file() else {}
     F, M = kept.get("F", kept.get("occupied")), kept.get("M", kept.get("occluded"))
-    if F is None or M is None or "code" not in kept:
+    if F is None or M is None or "samples" not in kept:
         raise ValueError(
-            f"{str(path.parent)!r} holds no grid.npz with F, M and a code; give a finished folder "
-            "of jaxshape reconstruct or demo."
-        )
-    n = prior.resolution
-    if F.shape != (n, n, n) or M.shape != F.shape or kept["code"].shape != (prior.code_size,):
-        raise ValueError(
-            f"{str(path)!r} was made with other weights: its grids are {F.shape} and its code "
-            f"{kept['code'].shape}, but these weights know {(n, n, n)} and {(prior.code_size,)}. "
-            "Give those it was made with: --weights."
+            f"{str(path.parent)!r} holds no grid.npz with F, M and samples; give a finished folder "
+            "of jaxshape reconstruct or demo, made without --samples 0."
         )
     kind = np.float32 if "F" in kept else bool
-    return {"F": F.astype(kind), "M": M.astype(kind), "code": kept["code"]}
+    return {"F": F.astype(kind), "M": M.astype(kind), "samples": kept["samples"]}
 
 
 def _camera(found: ResultFolder) -> tuple[Intrinsics, tuple[int, int]]:

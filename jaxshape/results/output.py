@@ -290,7 +290,7 @@ def _write_grids(path: Path, observation: Observation, one: Any) -> None:
         "T_world_object": observation.T_world_object,
     }
     if one.samples is not None:
-        arrays["samples"] = one.samples > 0
+        arrays["samples"] = np.float16(one.samples)
         arrays["probability"] = one.probability.astype(np.float16)
     if observation.soft is not None:
         arrays["F"], arrays["M"] = (np.float16(x) for x in observation.soft[:2])
