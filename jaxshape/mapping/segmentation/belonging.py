@@ -2,8 +2,9 @@
 
 A part of one frame belongs to the object if it lies in the object's box, or if it shows again what
 is known to be the object and ends within the prior's reach: so that a box which was cut too short
-does not exclude what it should have held. Parts that other frames show apart from the object, or
-that go on beyond its reach, are something else.
+does not exclude what it should have held. So does a part that two frames show together with the
+object: the seat below a back that was all that the first frame showed. Parts that other frames show
+apart from the object, or that go on beyond its reach, are something else.
 """
 
 from typing import NamedTuple
@@ -44,12 +45,14 @@ class Seen(NamedTuple):
             too small to be a part `[h w]`.
         sure: True on pixels that are known to show the object `[h w]`.
         corners: Labels of the parts that may be corners of something nearer `[n]`.
+        pairs: Pairs of labels of parts that belong together in this frame `[m 2]`.
     """
 
     points: Float[np.ndarray, "h w 3"]
     labels: Int[np.ndarray, "h w"]
     sure: Bool[np.ndarray, "h w"]
     corners: Int[np.ndarray, " n"] = np.zeros(0, int)
+    pairs: Int[np.ndarray, "m 2"] = np.zeros((0, 2), int)
 
 
 class _Part(NamedTuple):
@@ -104,17 +107,20 @@ def belonging(
     parts = [part for i, seen in enumerate(frames) for part in _parts(i, seen, box, reach, column)]
     sure = [seen.points[seen.sure & points_in_box(seen.points, reach)] for seen in frames]
     background = [_background(seen, column) for seen in frames]
-    known, whole = _Known(_tree(sure), _tree(background)), set()
+    known, whole, clouds = _Known(_tree(sure), _tree(background)), set(), sure
     for _ in range(ROUNDS):
         ours = [part for part in parts if _is_ours(part, known.ours)]
+        if beside := _together(parts, ours, whole, frames):
+            known = known._replace(ours=_tree([*clouds, *(part.points for part in beside)]))
+            ours = [part for part in parts if _is_ours(part, known.ours)]
         taken = {part[:2] for part in ours}
         apart = [part for part in parts if part[:2] not in taken and _is_apart(part)]
         known = known._replace(others=_tree([*background, *(part.points for part in apart)]))
         before, whole = whole, {part[:2] for part in ours if _is_whole(part, known)}
         if whole == before:
             break
-        more = [part.points for part in ours if part[:2] in whole]
-        known = known._replace(ours=_tree([*sure, *more]))
+        clouds = [*sure, *(part.points for part in ours if part[:2] in whole)]
+        known = known._replace(ours=_tree(clouds))
     found = [
         _pixels(seen, [p for p in ours if p.frame == i], whole, known, box, reach)
         for i, seen in enumerate(frames)
@@ -129,6 +135,24 @@ def _is_ours(part: _Part, ours: KDTree) -> bool:
     """
     again = float(_near(part.points, ours).mean())
     return again > MOSTLY if part.is_corner else part.in_box > MOSTLY or again > AGAIN
+
+
+def _together(
+    parts: list[_Part], ours: list[_Part], whole: set[tuple[int, int]], frames: list[Seen]
+) -> list[_Part]:
+    """The parts that belong together with the object in their frames, where two frames say so."""
+    sure = {part[:2] for part in ours if part[:2] in whole}
+    partners = {
+        (frame, int(b))
+        for frame, seen in enumerate(frames)
+        for pair in seen.pairs
+        for a, b in (pair, pair[::-1])
+        if (frame, int(a)) in sure
+    }
+    known = {part[:2] for part in ours}
+    found = [p for p in parts if p[:2] in partners - known and p.in_reach > WHOLLY]
+    clouds = {i: _tree([p.points for p in found if p.frame != i]) for i in {p.frame for p in found}}
+    return [p for p in found if float(_near(p.points, clouds[p.frame]).mean()) > MOSTLY]
 
 
 def _is_apart(part: _Part) -> bool:

@@ -237,6 +237,36 @@ def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
         chosen, others = chosen + new, others - set(new)
 
 
+def pairs(labels: Int[np.ndarray, "h w"], view: Scene) -> list[tuple[int, int]]:
+    """Pairs of clusters that belong together: a back and the seat below it, a seat and its legs.
+
+    Corners of something nearer are in none of them.
+    """
+    at_border = corners(labels, view)
+    present = [i for i in np.unique(labels[labels > 0]).tolist() if i not in at_border]
+    clouds = {label: _some(view.points[labels == label]) for label in present}
+    sizes = np.bincount(np.maximum(labels, 0).ravel())
+    present = sorted(present, key=lambda label: int(sizes[label]))
+    return [
+        (one, other)
+        for i, one in enumerate(present)
+        for other in present[i + 1 :]
+        if _may_touch(clouds[one], clouds[other])
+        and _belongs(clouds[one], clouds[other], view.floor)
+    ]
+
+
+def _some(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Every so many of the points, a few hundred in all."""
+    return points[:: 1 + len(points) // 500]
+
+
+def _may_touch(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"]) -> bool:
+    """Whether the boxes around two clusters, along the axes of the camera, are near each other."""
+    gap = np.maximum(one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0))
+    return bool((gap < HIDDEN).all())
+
+
 def corners(labels: Int[np.ndarray, "h w"], view: Scene) -> list[int]:
     """Small clusters at the border of the image that hide some of a far larger one.
 

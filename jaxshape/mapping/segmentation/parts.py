@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxshape.mapping.segmentation.clusters import background, clusters, corners, look
+from jaxshape.mapping.segmentation.clusters import background, clusters, corners, look, pairs
 
 SPECK = -1
 """Label of pixels that are part of no cluster and of no plane."""
@@ -27,6 +27,7 @@ class Parts(NamedTuple):
         sure: True on pixels that are known to show the object `[h w]`.
         corners: Labels of the clusters that may be corners of something nearer, of which the image
             shows no more `[n]`.
+        pairs: Pairs of labels of clusters that belong together in this frame `[m 2]`.
         floor: Normal of the floor, towards the camera, and the height of the camera above it in
             metres, in the frame of the camera `[4]`; NaN where no floor is seen.
         evidence: Evidence from this frame, from 0 to 1, that this is the floor.
@@ -36,6 +37,7 @@ class Parts(NamedTuple):
     labels: Int[np.ndarray, "h w"]
     sure: Bool[np.ndarray, "h w"]
     corners: Int[np.ndarray, " n"]
+    pairs: Int[np.ndarray, "m 2"]
     floor: Float[np.ndarray, " 4"]
     evidence: float
     are_numbered: bool = False
@@ -63,10 +65,11 @@ def parts_of(
     free = np.isfinite(view.z) & ~background(view, None, with_tables=with_tables)
     labels = clusters(view, free)
     at_border = np.array(corners(labels, view), int)
+    together = np.array(pairs(labels, view), int).reshape(-1, 2)
     labels[free & (labels == 0)] = SPECK
     known = np.zeros(depth.shape, bool) if sure is None else sure
     if view.floor is None:
-        return Parts(labels, known, at_border, NO_FLOOR, 0.0)
+        return Parts(labels, known, at_border, together, NO_FLOOR, 0.0)
     plane = view.floor.plane
     floor = np.array([*plane.normal, plane.offset], np.float64)
-    return Parts(labels, known, at_border, floor, view.floor.confidence)
+    return Parts(labels, known, at_border, together, floor, view.floor.confidence)
