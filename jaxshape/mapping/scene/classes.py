@@ -166,40 +166,72 @@ WORST = -1.4
 -1.57 or less, of plants -1.58 or less."""
 
 
-def decide(priors: Mapping[str, ShapePrior], grids: Grids) -> list[Decision]:
+UNUSUAL = 14.0
+"""Sum of the squared deviations of an object's three extents from the usual ones of a class above
+which it is not of the class. Each deviation is in standard deviations of the extent's logarithm; of
+objects of the class 0.3 % have a larger sum."""
+
+
+def decide(
+    priors: Mapping[str, ShapePrior],
+    grids: Grids,
+    sizes: Float[np.ndarray, "object 3"] | None = None,
+) -> list[Decision]:
     """The class and the front of each object; all objects go through one call for each class.
 
     Args:
         priors: The prior of each class, by its name; one or more.
         grids: F and M of each object `[object x y z]`, in boxes with any front.
+        sizes: Extents of these boxes, in metres; None where objects of any size may be of a class.
     """
     count = len(grids.occupied)
     rows = jnp.minimum(jnp.arange(1 << (count - 1).bit_length()), count - 1)
     padded = Grids(grids.occupied[rows], grids.occluded[rows])
     found = {name: predict_hidden(prior, padded) for name, prior in priors.items()}
     return [
-        decided({name: Predicted(*(np.asarray(x)[i] for x in of)) for name, of in found.items()})
+        decided(
+            {name: Predicted(*(np.asarray(x)[i] for x in of)) for name, of in found.items()},
+            None if sizes is None else sizes[i],
+        )
         for i in range(count)
     ]
 
 
-def decided(found: Mapping[str, Predicted]) -> Decision:
+def decided(
+    found: Mapping[str, Predicted], size: Float[np.ndarray, " 3"] | None = None
+) -> Decision:
     """The class and the front of one object, from what each prior predicts.
 
     Args:
         found: Scores `[turn]` of each class.
+        size: Extents of the object's box, in metres; None where it may have any size.
     """
     total = {name: np.asarray(one.surface) for name, one in found.items()}
     fronts = {name: int(own.argmax()) for name, own in total.items()}
     margins = {name: _margin(name, total) for name in total}
     best = max(margins, key=lambda name: margins[name])
     likely = _sigmoid((margins[best] - MARGIN) / SPREAD)
-    if total[best].max() < WORST:
+    is_odd = size is not None and deviation(best, size, fronts[best]) > UNUSUAL
+    if total[best].max() < WORST or is_odd:
         likely = min(likely, 0.1)
     scores = {name: round(margin, 3) for name, margin in margins.items()}
     if likely > 0.5:
         return Decision(best, fronts[best], likely, scores)
     return Decision(None, 0, 1 - likely, scores)
+
+
+def deviation(name: str, size: Float[np.ndarray, " 3"], quarters: int) -> float:
+    """How far the extents of an object are from the usual ones of a class (`UNUSUAL`).
+
+    Args:
+        name: Name of the class.
+        size: Extents of the object's box along x, y and z, in metres.
+        quarters: Quarters of a turn of its front from that of the box.
+    """
+    usual = sizes_of(name)
+    typical, spread = np.array(usual.typical_size), np.array(usual.size_spread)
+    own = np.asarray(size)[[2, 1, 0]] if quarters % 2 else np.asarray(size)
+    return float(np.sum((np.log(own / typical) / spread) ** 2))
 
 
 def _margin(name: str, total: Mapping[str, Float[np.ndarray, " turn"]]) -> float:

@@ -275,7 +275,8 @@ def _decided(objects: tuple[SceneObject, ...], classes: SceneClasses) -> list[Sc
     stacked = Grids(
         jnp.stack([one.occupied for one in grids]), jnp.stack([one.occluded for one in grids])
     )
-    decisions = decide({one.name: one.prior for one in classes.known}, stacked)
+    sizes = np.stack([one.progress.start.box.size for one in objects])
+    decisions = decide({one.name: one.prior for one in classes.known}, stacked, sizes)
     return [
         one._replace(decision=d if _is_seen_well(one) else d._replace(name=None, quarters=0))
         for one, d in zip(objects, decisions, strict=True)

@@ -10,7 +10,7 @@ from jaxshape.data.chairs import random_chair
 from jaxshape.data.tables import random_table
 from jaxshape.geometry.grids import Grids
 from jaxshape.mapping.scene.boxing import turned_box
-from jaxshape.mapping.scene.classes import decide, decided, unfilled
+from jaxshape.mapping.scene.classes import UNUSUAL, decide, decided, deviation, unfilled
 from jaxshape.mapping.scene.evidence import TURNS, hidden_parts, predict_hidden, turned
 
 
@@ -115,6 +115,17 @@ def test_a_decision_needs_more_than_the_best_of_bad_answers():
     assert (clear.name, clear.quarters) == ("chair", 1)
     tied = decided({"chair": _scores([-1.0] * 4), "table": _scores([-1.0] * 4)})
     assert tied.name is None
+
+
+def test_an_object_of_no_usual_size_is_of_no_class():
+    """A strip of wall, 0.2 m by 1.35 m, is no chair, however well it is predicted."""
+    found = {"chair": _scores([-1.4, -1.0, -1.5, -1.4])}
+    chair, strip = np.array([0.55, 0.85, 0.6]), np.array([0.55, 1.35, 0.2])
+    assert decided(found, chair).name == "chair"
+    assert decided(found, strip).name is None
+    assert deviation("chair", strip, 1) > UNUSUAL > 10 * deviation("chair", chair, 0)
+    # The box's x is along the front of an object that is turned by a quarter.
+    assert deviation("chair", strip, 1) == deviation("chair", strip[::-1], 0)
 
 
 def _scores(surface):
