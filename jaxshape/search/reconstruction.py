@@ -1,6 +1,7 @@
 """From measurements to shapes: first code, search, completed and composed grids (paper, Fig. 4)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -207,19 +208,10 @@ def reconstruct(
                 precision=config.precision,
             )
             code, logits, objective = found.code, found.logits, score(found.logits, targets)
-        fill = partial(complete, symmetry=config.symmetry, conditional=prior.model.conditional)
-        filled = fill(grids, logits)
-        samples = probability = None
-        if config.samples:
-            draw = partial(sample_codes, residual=residual, target=targets)
-            codes = draw(keys, prior, grids, code, config.samples)
-            decoded = decode(prior, codes, grids)
-            each = [jnp.broadcast_to(x[:, None], decoded.shape) for x in grids[:2]]
-            samples = fill(Grids(*each), decoded).logits
-            calibration = prior.calibration or UNCALIBRATED
-            hidden = calibration.probability(filled.logits, jnp.std(samples, axis=1))
-            probability = known_or(grids, hidden)
-        return Reconstruction(
+        filled = complete(
+            grids, logits, symmetry=config.symmetry, conditional=prior.model.conditional
+        )
+        shape = Reconstruction(
             first_code=first_code,
             code=code,
             completed_first=first_logits > 0,
@@ -235,12 +227,44 @@ def reconstruct(
             path=found and found.path,
             iterations=found and found.iterations,
             stop=found and found.stop,
-            samples=samples,
-            probability=probability,
         )
+        return sampled(keys, prior, grids, shape, config, residual) if config.samples else shape
 
     rows = one_key_each(keys, len(grids.occupied)), grids, earlier
     return over_devices(rebuild, prior, rows, devices)
+
+
+def sampled(
+    keys: Key[Array, " object"],
+    prior: ShapePrior,
+    grids: Grids,
+    found: Reconstruction,
+    config: RefineConfig,
+    residual: Residual,
+) -> Reconstruction:
+    """A reconstruction with samples of the posterior, and with what they say of each voxel.
+
+    Args:
+        keys: One random key for each object `[object]`.
+        prior: The shape prior.
+        grids: F and M of the objects `[object x y z]`.
+        found: Their reconstruction without samples.
+        config: Settings; `samples` is 1 or more.
+        residual: The residual that scores codes.
+    """
+    fill = partial(complete, symmetry=config.symmetry, conditional=prior.model.conditional)
+    target = None
+    if not prior.model.conditional:
+        target = jax.vmap(residual.target)(grids, decode(prior, found.first_code, grids))
+    codes = sample_codes(
+        keys, prior, grids, found.code, config.samples, residual=residual, target=target
+    )
+    decoded = decode(prior, codes, grids)
+    each = [jnp.broadcast_to(x[:, None], decoded.shape) for x in grids[:2]]
+    samples = fill(Grids(*each), decoded).logits
+    calibration = prior.calibration or UNCALIBRATED
+    hidden = calibration.probability(found.fill_logits, jnp.std(samples, axis=1))
+    return found._replace(samples=samples, probability=known_or(grids, hidden))
 
 
 @cache
@@ -250,13 +274,31 @@ def reconstruct_jit(
     """`reconstruct` with a fixed search, compiled once for each number of objects.
 
     Equal refiners, settings and residuals give the same function, which is then compiled already.
+    Samples are drawn by a program of their own, which leaves that of the search as it is without.
 
     Args:
         refiner: The search; None lets the first code stand.
         config: Settings of the search.
         residual: The residual to minimise; None for the one that `config.objective` names.
     """
-    return jax.jit(partial(reconstruct, refiner=refiner, config=config, residual=residual))
+    if not config.samples:
+        return jax.jit(partial(reconstruct, refiner=refiner, config=config, residual=residual))
+    search = reconstruct_jit(refiner, replace(config, samples=0), residual)
+
+    @jax.jit
+    def draw(keys, prior, grids, found):
+        def rows(prior, rows):
+            keys, grids, found = rows
+            wanted = residual_for(grids, config) if residual is None else residual
+            return sampled(keys, prior, grids, found, config, wanted)
+
+        return over_devices(rows, prior, (one_key_each(keys, len(found.code)), grids, found))
+
+    def run(keys, prior, occupied, occluded, *, data=None, **more):
+        found = search(keys, prior, occupied, occluded, data=data, **more)
+        return draw(keys, prior, Grids(jnp.asarray(occupied), jnp.asarray(occluded), data), found)
+
+    return run
 
 
 def fit_surface(

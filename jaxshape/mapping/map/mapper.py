@@ -95,12 +95,12 @@ def build_mapper(
     Returns:
         The four functions over the state of a map.
     """
+    # Without a search the long one is the short one, which is then compiled once.
+    short = search.iterations if refiner is None else mapping.keyframe_iterations
     parts = Parts(
         prior,
         jax.random.key(seed),
-        reconstruct_jit(
-            refiner, replace(search, iterations=mapping.keyframe_iterations, samples=0)
-        ),
+        reconstruct_jit(refiner, replace(search, iterations=short, samples=0)),
         reconstruct_jit(refiner, search),
         mapping,
         track,
