@@ -290,10 +290,10 @@ def _write_grids(path: Path, observation: Observation, one: Any) -> None:
         "T_world_object": observation.T_world_object,
     }
     if one.samples is not None:
-        arrays["samples"] = np.float16(one.samples)
+        arrays["samples"] = np.asarray(one.samples, np.float16)
         arrays["probability"] = one.probability.astype(np.float16)
     if observation.soft is not None:
-        arrays["F"], arrays["M"] = (np.float16(x) for x in observation.soft[:2])
+        arrays["F"], arrays["M"] = (np.asarray(x, np.float16) for x in observation.soft[:2])
     if observation.truth is not None:
         arrays["truth"] = observation.truth
     with atomic_path(path) as temporary:

@@ -85,7 +85,7 @@ def observation_of(state: MapState) -> Observation:
     """Measurement of the object by the keyframes of a map."""
     soft = grids_of(state)
     grids = binary(soft)
-    is_soft = isinstance(state.measurement, DistanceField)
+    field = state.measurement if isinstance(state.measurement, DistanceField) else None
     every = max(1, len(state.keyframes) // FRAMES_TO_SHOW)
     shown = state.keyframes[::every][:FRAMES_TO_SHOW]
     return Observation(
@@ -95,8 +95,8 @@ def observation_of(state: MapState) -> Observation:
         frame=state.place.frame,
         T_world_object=state.place.box.T_world_object,
         truth=None,
-        field=state.measurement if is_soft else None,
-        soft=soft if is_soft else None,
+        field=field,
+        soft=None if field is None else soft,
         sensor=state.fusing.sensor,
     )
 

@@ -146,7 +146,7 @@ def _write_together(path: Path, written: Many[WrittenObject]) -> None:
         one.found.mesh.copy().apply_transform(one.one.progress.start.box.T_world_object)
         for one in written
     ]
-    together: trimesh.Trimesh = trimesh.util.concatenate(meshes)
+    together: Any = trimesh.util.concatenate(meshes)
 
     def joined(name: str) -> Any:
         parts = [getattr(one.found, name) for one in written]
