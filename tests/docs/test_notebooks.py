@@ -135,10 +135,6 @@ def test_the_recording_is_read_in_metres_and_mapped(run):
     np.testing.assert_allclose(sequence[1].T_world_camera, T, atol=1e-5)
 
 
-@pytest.mark.skipif(
-    not (hasattr(js.RefineConfig, "samples") and hasattr(js, "next_views")),
-    reason="needs samples and next views",
-)
 def test_the_best_view_settles_most(run):
     ran = run("uncertainty_and_next_views")
     ranked = ran.names["ranked"]

@@ -255,7 +255,7 @@ def test_a_found_object_stands_upright_and_without_the_floor(begin, copy, walk, 
     """The prior places it; what it gets and what becomes of its answer is ours."""
     asked = []
 
-    def place(prior, seen, floor, known):
+    def place(prior, seen, floor, known, config):
         asked.append((seen, float(floor)))
         return known._replace(
             T_world_object=jaxlie.SE3.from_translation(jnp.median(seen.surface, axis=0)),
@@ -284,13 +284,13 @@ def test_a_found_object_stands_upright_and_without_the_floor(begin, copy, walk, 
 
 
 def test_a_box_that_is_not_sure_is_said_and_none_is_refused(begin, folder, monkeypatch):
-    def symmetric(prior, seen, floor, known):
+    def symmetric(prior, seen, floor, known, config):
         return known._replace(misfit=jnp.float32(0.1), margin=jnp.float32(0.001))
 
     monkeypatch.setattr(finding, "_place", symmetric)
     _, start = begin(folder, box=False)
     assert any("front is not sure" in warning for warning in start.warnings)
 
-    monkeypatch.setattr(finding, "_place", lambda prior, seen, floor, known: known)
+    monkeypatch.setattr(finding, "_place", lambda prior, seen, floor, known, config: known)
     with pytest.raises(SequenceError, match="too little of it to place it"):
         begin(folder, box=False)
