@@ -27,7 +27,7 @@ AWAY = (1.7, 1.3, 1.5), (1.6, 0.5, -0.5)
 def ends(monkeypatch):
     """The placement that takes the ends of the points as the box."""
 
-    def place(prior, seen, floor, known):
+    def place(prior, seen, floor, known, config):
         lower, upper = (jnp.quantile(seen.surface, q, axis=0) for q in (0.004, 0.996))
         lower = lower.at[1].set(jnp.where(jnp.isnan(floor), lower[1], floor))
         middle = jaxlie.SE3.from_translation((lower + upper) / 2)
