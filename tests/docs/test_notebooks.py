@@ -98,6 +98,7 @@ def test_quickstart_keeps_measured_voxels(run):
     assert ran.figures == 1 and (ran.folder / "chair.ply").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_gradients_spend_as_many_calls_as_cma_es(run):
     ran = run("gradients_against_cma_es")
     price, found = ran.names["PRICE"], ran.names["found"]
@@ -107,6 +108,7 @@ def test_gradients_spend_as_many_calls_as_cma_es(run):
     assert ran.figures == 1
 
 
+@pytest.mark.slow
 def test_the_linear_decoder_explains_training_chairs_and_is_searched(run):
     names = run("own_decoder").names
     prior, surfaces = names["prior"], names["surfaces"]
@@ -118,6 +120,7 @@ def test_the_linear_decoder_explains_training_chairs_and_is_searched(run):
     assert (names["found"].objective < names["found"].first_objective).all()
 
 
+@pytest.mark.slow
 def test_the_own_category_is_trained_by_the_command(run):
     ran = run("own_category")
     assert ran.names["prior"].code_size == 4
@@ -125,6 +128,7 @@ def test_the_own_category_is_trained_by_the_command(run):
     assert len(list((ran.folder / "tables").glob("*.ply"))) == 12
 
 
+@pytest.mark.slow
 def test_the_recording_is_read_in_metres_and_mapped(run):
     names = run("recording").names
     sequence, film = names["sequence"], names["film"]
@@ -135,6 +139,7 @@ def test_the_recording_is_read_in_metres_and_mapped(run):
     np.testing.assert_allclose(sequence[1].T_world_camera, T, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_best_view_settles_most(run):
     ran = run("uncertainty_and_next_views")
     ranked = ran.names["ranked"]
