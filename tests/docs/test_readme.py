@@ -31,6 +31,7 @@ INSTEAD = {
     "click=(240, 150)": "click=(64, 70)",
     "--click 240 150": "--click 64 70",
     "--object 2": "--click 64 70",
+    'js.open_sequence("room/")': 'js.open_sequence("scan")',
 }
 """Of code and of commands, by what runs in its place; images of the test are 128 pixels wide."""
 
@@ -56,6 +57,9 @@ NOT_RUN = {
     "git clone <this repository> && cd jaxshape": "fetches",
     "pip install jaxshape": "installs",
     "jaxshape view out/reconstruct": "serves until it is stopped; tests/report/test_viewer.py",
+    "jaxshape view out/scene": "serves until it is stopped",
+    "jaxshape next": "needs a result; tests/report/test_next_views.py runs it",
+    "jaxshape scene": "tests/mapping/scene rebuilds a scene",
     "jaxshape bench": "tests/bench runs it",
     "srun --ntasks-per-node=1 jaxshape evaluate": "needs a cluster",
     "jaxshape evaluate --coordinator": "needs two machines; tests/test_hosts.py runs it on one",
