@@ -15,7 +15,7 @@ Extreme chairs show possible cases, not their frequency; the shares over all cha
 frequency.
 
 Results: experiments/results/gradient_failures.json, and .png and .svg of the chairs on which CMA-ES
-    leads; gradient_failures_opposite has the chairs on which it trails. Finished chairs are kept.
+leads; gradient_failures_opposite has the chairs on which it trails. Finished chairs are kept.
 Time: 6 minutes on two cores after iou_by_frames.py, 8 without.
 """
 

@@ -2,7 +2,7 @@
 
 A prior knows its objects upright and from their front. Half of a surface is hidden from it, four
 times: back, front, top and bottom. It predicts the hidden part best where the mesh is oriented like
-    the training meshes. How seats stand (`jaxshape.data.orientation`) has a say in which way is up.
+the training meshes. How seats stand (`jaxshape.data.orientation`) has a say in which way is up.
 Of 13 real seats turned at random to one of 24 orientations, 12 were turned back so.
 """
 

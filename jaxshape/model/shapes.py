@@ -1,8 +1,8 @@
 """The seam of every shape space: a model is three pure functions over a pytree of parameters.
 
     first code = encode(params, grids)            F and M to a code, once per object
-    prepared = prepare(params, grids, precision) everything independent of the code, once logits
-    = decode(prepared, codes)            thousands of times
+    prepared   = prepare(params, grids, precision)  everything independent of the code, once
+    logits     = decode(prepared, codes)            thousands of times
 
 Code outside `jaxshape.model` reaches a network through the `ShapeModel` that a `ShapePrior` carries
 with its parameters. `autoencoder` and `pca` are members; docs/examples has one of yours.
