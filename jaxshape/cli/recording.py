@@ -81,7 +81,6 @@ class Reconstruct(Rebuild):
         import numpy as np
 
         from jaxshape.data.boxes import read_box
-        from jaxshape.data.sequences import open_sequence
         from jaxshape.geometry.grids import binary
         from jaxshape.mapping.map.mapper import build_mapper
         from jaxshape.mapping.map.recording import follow
@@ -97,20 +96,14 @@ class Reconstruct(Rebuild):
         require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")
         prior, refiner, search = self.prepare()
         placer = self.placer(prior)
-        sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
-        with console.status("inspecting the recording"):
-            found = inspected(
-                sequence,
-                self.frames,
-                convention=self.convention,
-                keep_scale=self.depth_scale is not None,
-                guess_camera=self.guess_camera,
-            )
-        sequence = found.sequence
-        require(
-            self.first < len(sequence),
-            f"--first is {self.first}, but there are {len(sequence)} frames, counted from 0.",
+        found = opened(
+            self.frames,
+            first=self.first,
+            depth_scale=self.depth_scale,
+            convention=self.convention,
+            guess_camera=self.guess_camera,
         )
+        sequence = found.sequence
         if self.list_objects:
             return self._list_objects(sequence)
         prompt = Prompt(self.click, self.region, self.depth_range, self.object)
@@ -233,24 +226,34 @@ def _note(progress: Any) -> str:
     return f"{len(progress.state.keyframes)} keyframes"
 
 
-def inspected(
-    sequence: Any,
+def opened(
     frames: Path,
     *,
+    first: int,
+    depth_scale: float | None,
     convention: tuple[ConventionName, ...],
-    keep_scale: bool,
     guess_camera: bool,
 ) -> Any:
-    """The recording as it is to be read, and what was noticed; refuses a guessed camera."""
+    """The recording as it is to be read, and what was noticed (`Inspection`).
+
+    Refuses a guessed camera, and a first frame that is not there.
+    """
+    from jaxshape.data.sequences import open_sequence
     from jaxshape.data.sequences.inspection import inspect_sequence
 
-    require(
-        guess_camera or not sequence.camera_is_guess,
-        f"{str(frames)!r} holds no camera, and a focal length that is wrong by 5 % bends "
-        "the surface: write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt there, or add "
-        f"--guess-camera to take that of {sequence.camera}.",
-    )
-    return inspect_sequence(sequence, convention or None, keep_scale=keep_scale)
+    sequence = open_sequence(frames, depth_scale=depth_scale)
+    with console.status("inspecting the recording"):
+        require(
+            guess_camera or not sequence.camera_is_guess,
+            f"{str(frames)!r} holds no camera, and a focal length that is wrong by 5 % bends "
+            "the surface: write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt there, or add "
+            f"--guess-camera to take that of {sequence.camera}.",
+        )
+        keep_scale = depth_scale is not None
+        found = inspect_sequence(sequence, convention or None, keep_scale=keep_scale)
+    count = len(found.sequence)
+    require(first < count, f"--first is {first}, but there are {count} frames, counted from 0.")
+    return found
 
 
 def poses_used(found: Any, frames: Path, poses: str) -> bool:

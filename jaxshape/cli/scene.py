@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from jaxshape import checks
 from jaxshape.claim import Output
-from jaxshape.cli.common import console, progress_bar, require, warn
+from jaxshape.cli.common import console, progress_bar, warn
 from jaxshape.cli.inspecting import ConventionName
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.search.config import RefineConfig
@@ -70,8 +70,7 @@ class BuildScene:
 
     def run(self) -> None:
         start = time.perf_counter()
-        from jaxshape.cli.recording import inspected, poses_used
-        from jaxshape.data.sequences import open_sequence
+        from jaxshape.cli.recording import opened, poses_used
         from jaxshape.mapping.scene.classes import build_classes
         from jaxshape.mapping.scene.following import finish_scene, follow_scene
         from jaxshape.model.weights import load_scene_priors
@@ -88,20 +87,14 @@ class BuildScene:
             track=self.tracking,
             seed=self.seed,
         )
-        sequence = open_sequence(self.frames, depth_scale=self.depth_scale)
-        with console.status("inspecting the recording"):
-            found = inspected(
-                sequence,
-                self.frames,
-                convention=self.convention,
-                keep_scale=self.depth_scale is not None,
-                guess_camera=self.guess_camera,
-            )
-        sequence = found.sequence
-        require(
-            self.first < len(sequence),
-            f"--first is {self.first}, but there are {len(sequence)} frames, counted from 0.",
+        found = opened(
+            self.frames,
+            first=self.first,
+            depth_scale=self.depth_scale,
+            convention=self.convention,
+            guess_camera=self.guess_camera,
         )
+        sequence = found.sequence
         use_poses = poses_used(found, self.frames, self.poses)
         figures: dict[str, Any] = {
             "object": str(self.frames),

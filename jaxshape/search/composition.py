@@ -77,8 +77,7 @@ def agreed(
     """
     if jnp.asarray(occupied).dtype == bool:
         return jnp.asarray(occupied & ~occluded | (probability > 0.5))
-    F, M = jnp.asarray(occupied), jnp.asarray(occluded)
-    return (probability + (1 - M) * F + M * probability) / 2 > 0.5
+    return (probability + known_or(Grids(occupied, occluded), probability)) / 2 > 0.5
 
 
 def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*batch x y z"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.map.state import MapState, no_surface
+from jaxshape.mapping.map.state import MapState, no_surface, power_of_two
 from jaxshape.mapping.tracking import icp, registration, surfels
 from jaxshape.mapping.tracking.icp import Alignment
 from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame, object_pixels, view_again
@@ -60,7 +60,7 @@ def _surfaces(states: Sequence[MapState], config: TrackingConfig) -> tuple[Surfa
     nothing = no_surface(states[0].place.lattice)
     if config.against == "keyframe":
         return (nothing,)
-    count = 1 << (len(states) - 1).bit_length()
+    count = power_of_two(len(states))
     return (*(one.surface for one in states), *[nothing] * (count - len(states)))
 
 

@@ -24,6 +24,7 @@ from jaxshape.mapping.map.state import (
     carried,
     grids_of,
     odometry_of,
+    power_of_two,
     realigned,
     with_surface,
 )
@@ -209,7 +210,7 @@ def _searched(
     states: Sequence[MapState],
 ) -> Reconstruction:
     """The shapes of some objects of one class, and of copies of the last that fill the batch."""
-    count = 1 << (len(states) - 1).bit_length()
+    count = power_of_two(len(states))
     rows = [min(i, len(states) - 1) for i in range(count)]
     # The same numbers for each: what an object becomes does not depend on what stands beside it.
     key = jax.random.fold_in(parts.key, len(states[0].keyframes))

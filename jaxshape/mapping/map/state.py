@@ -235,7 +235,7 @@ def realigned_poses(states: Sequence[MapState]) -> list[jaxlie.SE3]:
     information = jnp.where(jnp.asarray(is_keyframe)[:, None, None], information, 0)
     seen = [_seen_by(state, capacity) for state in states]
     # The number of objects is a power of two, too: the others have no points and no shape.
-    rows = 1 << (len(seen) - 1).bit_length()
+    rows = power_of_two(len(seen))
     clouds, lattice, probability = _stacked([*seen, *[_unseen(seen[0])] * (rows - len(seen))])
     center = jnp.float32(states[0].place.box.T_world_object[:3, 3])
     T = _realign(
@@ -262,6 +262,15 @@ def _stacked(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
+def power_of_two(count: int) -> int:
+    """The number of rows for which a program is compiled: the next power of two.
+
+    Args:
+        count: Rows that are needed, 1 or more.
+    """
+    return 1 << (count - 1).bit_length()
+
+
 def capacity_for(count: int) -> int:
     """The number of keyframes for which realigning is compiled: the next power of two.
 
@@ -272,7 +281,7 @@ def capacity_for(count: int) -> int:
         8, 16, 32, ...: with each twice as large as the one before, a map that grows is compiled
         for a few times only.
     """
-    return max(_LEAST_CAPACITY, 1 << (count - 1).bit_length())
+    return max(_LEAST_CAPACITY, power_of_two(count))
 
 
 @jax.jit

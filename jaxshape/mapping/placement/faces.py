@@ -7,7 +7,7 @@ does its box. The place of a face that was not seen is what the prior expects.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxshape.data.boxes import Box
 from jaxshape.geometry.camera import Intrinsics
@@ -262,13 +262,31 @@ def _passed_outside(
 
 def _passed(points: Float[np.ndarray, "n 3"], view: Cutout) -> Bool[np.ndarray, " n"]:
     """Points in the world that a keyframe saw through."""
+    inside, row, column, z = looked_at(points, view)
+    return inside & (np.asarray(view.depth)[row, column] > z + CLEAR)
+
+
+def looked_at(
+    points: Float[np.ndarray, "n 3"], view: Cutout
+) -> tuple[
+    Bool[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, " n"]
+]:
+    """Where points lie in the image of a view.
+
+    Args:
+        points: The points in the world `[n 3]`, in metres.
+        view: The view.
+
+    Returns:
+        Whether each point lies in the image and in front of the camera, the row and the column of
+        its pixel, 0 where it does not, and its depth in metres.
+    """
     T = np.linalg.inv(view.T_world_camera)
     p = points @ T[:3, :3].T + T[:3, 3]
     fx, fy, cx, cy = (float(x) for x in view.intrinsics)
     z = np.maximum(p[:, 2], 1e-6)
     u, v = np.floor(fx * p[:, 0] / z + cx), np.floor(fy * p[:, 1] / z + cy)
-    depth = np.asarray(view.depth)
-    h, w = depth.shape
+    h, w = view.depth.shape
     inside = (p[:, 2] > 0) & (0 <= u) & (u < w) & (0 <= v) & (v < h)
     row, column = (np.where(inside, x, 0).astype(int) for x in (v, u))
-    return inside & (depth[row, column] > p[:, 2] + CLEAR)
+    return inside, row, column, z

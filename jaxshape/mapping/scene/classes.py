@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxshape.geometry.grids import Grids, binary
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import Mapper, build_mapper
+from jaxshape.mapping.map.state import power_of_two
 from jaxshape.mapping.placement.placing import PlacementConfig
 from jaxshape.mapping.scene.evidence import TURNS, Predicted, predict_hidden
 from jaxshape.model.shapes import ShapePrior
@@ -82,8 +83,10 @@ class Decision(NamedTuple):
     scores: dict[str, float]
 
 
+_CHAIRS = PlacementConfig()
+
 SIZES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
-    "chair": ((0.58, 0.86, 0.60), (0.34, 0.21, 0.29)),
+    "chair": (_CHAIRS.typical_size, _CHAIRS.size_spread),
     "table": ((1.05, 0.68, 0.72), (0.50, 0.25, 0.42)),
 }
 """Geometric means of the extents of procedural objects along x, y and z, in metres, and the
@@ -185,7 +188,7 @@ def decide(
         sizes: Extents of these boxes, in metres; None where objects of any size may be of a class.
     """
     count = len(grids.occupied)
-    rows = jnp.minimum(jnp.arange(1 << (count - 1).bit_length()), count - 1)
+    rows = jnp.minimum(jnp.arange(power_of_two(count)), count - 1)
     padded = Grids(grids.occupied[rows], grids.occluded[rows])
     found = {name: predict_hidden(prior, padded) for name, prior in priors.items()}
     return [

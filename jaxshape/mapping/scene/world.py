@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from jaxshape.mapping.placement.faces import Cutout, world_points
+from jaxshape.mapping.placement.faces import Cutout, looked_at, world_points
 
 CELL = 0.03
 """Edge length of a cell, in metres: things closer than that are one cluster."""
@@ -171,16 +171,9 @@ def keys_of(index: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
 def _seen_through(points: Float[np.ndarray, "n 3"], view: Cutout) -> Bool[np.ndarray, " n"]:
     """Points in the world that a view clearly sees through, at all pixels around."""
-    T = np.linalg.inv(view.T_world_camera)
-    p = points @ T[:3, :3].T + T[:3, 3]
-    fx, fy, cx, cy = (float(x) for x in view.intrinsics)
-    z = np.maximum(p[:, 2], 1e-6)
-    u, v = np.floor(fx * p[:, 0] / z + cx), np.floor(fy * p[:, 1] / z + cy)
+    inside, row, column, z = looked_at(points, view)
     depth = np.asarray(view.depth, np.float64)
     nearest = ndimage.minimum_filter(np.where(depth > 0, depth, 0), 3)
-    h, w = depth.shape
-    inside = (p[:, 2] > 0) & (0 <= u) & (u < w) & (0 <= v) & (v < h)
-    row, column = (np.where(inside, x, 0).astype(int) for x in (v, u))
     return inside & (nearest[row, column] > z + THROUGH + NOISE * z**2)
 
 
