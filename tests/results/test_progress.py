@@ -131,7 +131,7 @@ def test_each_file_is_replaced_when_whole_and_the_result_last(
     def full(*_):
         raise OSError("No space left on device.")
 
-    monkeypatch.setattr(module, "_keyframes", full)
+    monkeypatch.setattr(module, "keyframe_entries", full)
     with pytest.raises(OSError, match="No space"):
         write_progress(tmp_path, sequence, steps[-1], {"object": "later"}, running=False)
     assert json.loads((tmp_path / "result.json").read_text())["object"] == "earlier"

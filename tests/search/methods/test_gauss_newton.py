@@ -9,7 +9,7 @@ from problems import rosenbrock, run, sphere
 from jaxshape.model.shapes import decode
 from jaxshape.search.curvature import expand
 from jaxshape.search.methods.gauss_newton import damped_step, gauss_newton
-from jaxshape.search.objective import Own, composed, evaluation, objective, prepare_one
+from jaxshape.search.objective import ObjectTerms, composed, evaluation, objective, prepare_one
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.residuals import BALANCED, Target
 from jaxshape.search.space import LatentSpace
@@ -43,7 +43,7 @@ def about(linear_prior):
     prior, penalty = linear_prior, lambda code: jnp.sum(code**4)
     root = jnp.asarray(np.tril(rng.normal(size=(D, D))) + 3 * np.eye(D), jnp.float32)
     space, point = LatentSpace(jnp.ones(D), root, 1.0), jnp.linspace(-0.95, 0.9, D)
-    own = Own((), TARGET, jnp.float32(0.01))
+    own = ObjectTerms((), TARGET, jnp.float32(0.01))
     how = evaluation(
         prior.model, prepare_one(prior, None, "float32"), BALANCED, penalty, point, own
     )
