@@ -139,42 +139,6 @@ def test_misfit_depends_on_neither_units_nor_the_world():
 # ------------------------------------------------------------------------ the search
 
 
-def quadratic(hypothesis):
-    """Least at 0.3 in every number of a hypothesis."""
-    rows = jax.vmap(lambda h: sum(jnp.sum((x - 0.3) ** 2) for x in jax.tree.leaves(h)))
-    return rows(hypothesis)
-
-
-def hypotheses(count):
-    rng = np.random.default_rng(1)
-    draw = lambda *shape: jnp.asarray(rng.normal(size=(count, *shape)), jnp.float32)  # noqa: E731
-    return Hypothesis(UprightBox(draw(), draw(3), draw(3)), draw(5))
-
-
-UNIT = Hypothesis(UprightBox(*jnp.full(3, 0.1)), jnp.float32(0.1))
-
-
-def test_hypotheses_are_improved_each_on_its_own():
-    start = hypotheses(3)
-    together = placing.improve(start, quadratic, UNIT, 20)
-    assert (quadratic(together) < 0.5 * quadratic(start)).all()
-    for i in range(3):
-        one = jax.tree.map(lambda x, i=i: x[i : i + 1], start)
-        alone = placing.improve(one, quadratic, UNIT, 20)
-        jax.tree.map(
-            lambda x, y, i=i: np.testing.assert_allclose(x[0], y[i], rtol=1e-4), alone, together
-        )
-
-
-def test_what_has_no_unit_stays_and_a_nan_stays_alone():
-    start = hypotheses(3)
-    start = start._replace(point=start.point.at[1].set(jnp.nan))
-    unit = UNIT._replace(box=UNIT.box._replace(lower=jnp.array([0.1, 0.0, 0.1])))
-    found = placing.improve(start, quadratic, unit, 5)
-    np.testing.assert_array_equal(found.box.lower[:, 1], start.box.lower[:, 1])
-    assert (jnp.isfinite(found.point).all(axis=1) == jnp.array([True, False, True])).all()
-
-
 def test_the_earlier_box_and_the_best_of_each_direction_come_first():
     config = PlacementConfig(yaws=6, overhangs=(0.0, 0.5), kept=4)
     by_yaw = jnp.array([[5.0, 1.0, 2.0, 9.0, 4.0, 6.0], [7.0, 7.5, 8.0, 3.0, 5.5, 9.5]])
@@ -182,6 +146,18 @@ def test_the_earlier_box_and_the_best_of_each_direction_come_first():
     assert [int(i) for i in chosen] == [2, 10, 5, 7]  # 1, 3 and 4 have no better neighbour; then 7
     chosen = placing._most_promising(jnp.array([0.5, *by_yaw.ravel()]), config)
     assert chosen[0] == 0
+
+
+def test_the_rival_of_the_best_box_is_turned_otherwise_where_one_is():
+    yaws = jnp.array([0.0, 0.1, 3.0, 3.1])
+    boxes = Hypothesis(UprightBox(yaws, jnp.zeros((4, 3)), jnp.ones((4, 3))), jnp.zeros((4, 2)))
+    chosen = placing._finalists(boxes, jnp.array([1.0, 1.1, 1.4, 1.3]))
+    assert [int(i) for i in chosen] == [0, 3]
+    chosen = placing._finalists(boxes, jnp.array([1.1, 1.0, jnp.inf, jnp.inf]))
+    assert [int(i) for i in chosen] == [1, 0]
+    near = boxes._replace(box=boxes.box._replace(yaw=jnp.array([0.0, 0.1, 0.2, 0.3])))
+    chosen = placing._finalists(near, jnp.array([1.4, 1.3, 1.0, 1.1]))
+    assert [int(i) for i in chosen] == [2, 3]
 
 
 @pytest.fixture(scope="module")
@@ -247,6 +223,13 @@ def test_a_moved_and_turned_chair_is_found_there(chair, one_view, find):
     expected = (T @ found.T_world_object).as_matrix()
     np.testing.assert_allclose(moved.T_world_object.as_matrix(), expected, atol=0.02)
     np.testing.assert_allclose(moved.size, found.size, atol=0.02)
+
+
+def test_a_placement_fits_the_program_that_found_it(prior, one_view):
+    """Of other types, it would be compiled a second time, which takes longer than placing."""
+    _, found = one_view
+    expected = jax.tree.map(jax.typeof, placing.nothing_known(prior))
+    assert jax.tree.map(jax.typeof, found) == expected
 
 
 def test_an_earlier_placement_is_gone_on_from(chair, one_view, find):
