@@ -31,6 +31,7 @@ from jaxshape.mapping.placement.rays import pooled, sample_rays
 from jaxshape.mapping.segmentation.planes import (
     Floor,
     Plane,
+    along_walls,
     camera_points,
     dominant_planes,
     floor_plane,
@@ -203,8 +204,8 @@ def _place_first(
     use_pose: bool,
 ) -> Start:
     T_world_camera = _world_pose(frame, use_pose)
-    floor = _floor(frame, found)
-    up, of_up = _up(floor, T_world_camera, use_pose)
+    floor, vertical = _floor_and_vertical(frame, found)
+    up, of_up = _up(floor, vertical, T_world_camera, use_pose)
     cut = f"{frame.name}: {found.reason}"
     is_doubtful = floor is None or floor.confidence < SURE
     doubts = [cut] * (found.confidence < SURE) + [of_up] * is_doubtful
@@ -242,21 +243,35 @@ def _with_doubt_of_front(start: Start) -> Start:
     return start._replace(notes=(*start.notes, doubt), warnings=(*start.warnings, doubt))
 
 
-def _floor(frame: Frame, found: Segmentation) -> Floor | None:
+def _floor_and_vertical(
+    frame: Frame, found: Segmentation
+) -> tuple[Floor | None, Float[np.ndarray, " 3"] | None]:
+    """The floor, and the direction in which walls stand, as far as the frame shows them."""
     points = camera_points(frame.depth, frame.intrinsics)
     known = frame.depth > 0
     planes = dominant_planes(points[known])
-    return floor_plane(points[known], planes, points[found.segmented & known])
+    floor = floor_plane(points[known], planes, points[found.segmented & known])
+    return floor, along_walls(planes)
 
 
 def _up(
-    floor: Floor | None, T_world_camera: Float[np.ndarray, "4 4"], has_poses: bool
+    floor: Floor | None,
+    vertical: Float[np.ndarray, " 3"] | None,
+    T_world_camera: Float[np.ndarray, "4 4"],
+    has_poses: bool,
 ) -> tuple[Float[np.ndarray, " 3"], str]:
-    """The upward direction in the world, and where it comes from."""
+    """The upward direction in the world, and where it comes from.
+
+    A floor that is sure counts more than walls, and these more than a level surface that may be a
+    table top; what is left are the axes of the world and the image.
+    """
+    R_world_camera = T_world_camera[:3, :3]
+    if vertical is not None and (floor is None or floor.confidence < SURE):
+        return R_world_camera @ vertical, "No floor is sure; up is the direction of the walls."
     if floor is not None:
-        up = T_world_camera[:3, :3] @ np.asarray(floor.plane.normal, np.float64)
+        up = R_world_camera @ np.asarray(floor.plane.normal, np.float64)
         return up, f"Up is the normal of the floor ({floor.confidence:.0%} sure)."
-    of_camera = -T_world_camera[:3, 1]
+    of_camera = -R_world_camera[:, 1]
     if has_poses:
         axis, cosine = _nearest_axis(of_camera)
         if cosine > _NEARLY_LEVEL:

@@ -4,6 +4,7 @@ Points are in the camera frame, metres. A plane's normal looks towards the camer
 it grow towards the camera too.
 """
 
+from itertools import combinations
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -28,6 +29,12 @@ REFINED = 6
 
 MAX_TILT = 65.0
 """Largest angle, in degrees, between the floor's normal and up in the image of a camera in hand."""
+
+WALL = 0.05
+"""Least share of the points that a wall holds."""
+
+CORNER = 60.0
+"""Smallest angle, in degrees, at which two walls meet."""
 
 
 class Plane(NamedTuple):
@@ -204,3 +211,32 @@ def nothing_below(plane: Plane, points: Float[np.ndarray, "n 3"]) -> float:
     known = points[np.isfinite(points).all(axis=-1)]
     below = np.mean(height_above(plane, known) < -2 * tolerance(known[:, 2]))
     return float(np.clip(1 - below / 0.05, 0, 1))
+
+
+# Walls -----------------------------------------------------------------------------------------
+
+
+def along_walls(planes: list[Plane]) -> Float[np.ndarray, " 3"] | None:
+    """The vertical of a room whose floor is not seen: the direction that lies in two of its walls.
+
+    Any two large planes that meet at about a right angle count as walls where the line along which
+    they meet is roughly upright in the image of a camera in hand. Of several pairs, the one that
+    holds most points.
+
+    Args:
+        planes: Planes of the view, as `dominant_planes` finds them.
+
+    Returns:
+        The upward unit vector in the camera frame, or None where no two walls are seen.
+    """
+    largest = np.cos(np.deg2rad(CORNER))
+    walls = [plane for plane in planes if plane.share >= WALL]
+    pairs = []
+    for one, other in combinations(walls, 2):
+        if abs(one.normal @ other.normal) > largest:
+            continue
+        line = np.cross(one.normal, other.normal)
+        line *= -np.sign(line[1]) / np.linalg.norm(line)
+        if -line[1] > np.cos(np.deg2rad(MAX_TILT)):
+            pairs.append((min(one.share, other.share), line))
+    return max(pairs, key=lambda pair: pair[0])[1] if pairs else None

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from jaxshape.mapping.segmentation.planes import (
     NEIGHBOURS,
     Plane,
+    along_walls,
     camera_points,
     dominant_planes,
     floor_plane,
@@ -111,6 +112,29 @@ def test_a_table_top_is_no_sure_floor():
 def test_walls_and_ceilings_are_no_floors():
     walls = [Plane(np.array([0.0, 0, -1]), 2.0, 0.5), Plane(np.array([0.0, 1, 0]), 1.0, 0.4)]
     assert floor_plane(np.zeros((5, 3)), walls) is None
+
+
+@pytest.mark.parametrize("eye", [(0.9, 1.4, 1.8), (-1.2, 1.0, 1.5), (0.2, 2.0, 1.2)])
+@pytest.mark.parametrize("roll", [0.0, 20.0, -35.0])
+def test_two_walls_give_up_without_a_floor(eye, roll):
+    """The camera looks into the corner; what is level in the room is left out."""
+    seen = room([WALLS, CHAIR], eye, target=(1.0, 0.9, -1.0))
+    points = camera_points(seen.depth, K).reshape(-1, 3)
+    turn_camera = Rotation.from_euler("z", roll, degrees=True).as_matrix()
+    up = along_walls(dominant_planes(points @ turn_camera.T))
+    assert up is not None
+    assert up @ turn_camera @ seen.T_world_camera[1, :3] > np.cos(np.deg2rad(1.5))
+
+
+def test_one_wall_or_a_wall_and_a_floor_do_not_tell_the_vertical():
+    level, wall = Plane(unit((0, -0.9, -0.4)), 1.2, 0.4), Plane(unit((0, 0.4, -0.9)), 2.0, 0.3)
+    assert along_walls([wall]) is None
+    assert along_walls([level, wall]) is None  # they meet along a line that is level
+    side = Plane(np.array([1.0, 0, 0]), 1.0, 0.04)
+    assert along_walls([wall, side]) is None  # too small for a wall
+    slanted = Plane(unit((0.5, 0.4, -0.9)), 2.0, 0.3)
+    assert along_walls([wall, slanted]) is None  # nearly one wall
+    np.testing.assert_allclose(along_walls([wall, side._replace(share=0.2)]), unit((0, -0.9, -0.4)))
 
 
 def test_unmeasured_pixels_have_no_point():
