@@ -196,6 +196,15 @@ def write_icl_nuim(folder, seen):
     np.savetxt(folder / "cam_K.txt", seen.opencv[0])
 
 
+def write_realsense(folder, seen):
+    """The cameras of depth and colour do not start at the same time."""
+    for i in range(len(seen.depth)):
+        time = 1_600_000_000_000.5 + 33.333 * i
+        raw(seen.depth[i], 1000).astype("<u2").tofile(folder / f"walk_Depth_{time:.8f}.raw")
+        save(folder / f"walk_Color_{time + 4:.8f}.png", seen.color[i])
+    np.savetxt(folder / "cam_K.txt", seen.opencv[0])
+
+
 def save_float_tiff(path, depth):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(depth.astype(np.float32)).save(path)

@@ -14,6 +14,7 @@ from device_recordings import (
     write_bop,
     write_nerfstudio,
     write_npz,
+    write_realsense,
     write_record3d,
     write_replica,
     write_scannet,
@@ -336,3 +337,37 @@ def test_exr_is_read_or_refused_by_name(tmp_path):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"Y": depth}).write(str(path))
     np.testing.assert_array_equal(open_sequence(tmp_path)[0].depth, depth)
+
+
+# RealSense -------------------------------------------------------------------------------------
+
+
+def test_raw_depth_of_a_realsense_is_read_with_its_colours_and_times(tmp_path):
+    write_realsense(tmp_path, SEEN)
+    sequence = open_sequence(tmp_path)
+    assert sequence.layout == "realsense" and not sequence.has_poses
+    np.testing.assert_allclose(np.diff(sequence.times), 0.033333, atol=1e-6)
+    np.testing.assert_allclose(sequence.color_delays, 0.004, atol=1e-6)
+    for frame, depth, color in zip(sequence, SEEN.depth, SEEN.color, strict=True):
+        np.testing.assert_allclose(frame.depth, depth, atol=1e-6)
+        np.testing.assert_array_equal(frame.color, color)
+        np.testing.assert_allclose(frame.intrinsics, SEEN.K[0], atol=1e-6)
+
+
+def test_the_size_of_raw_depth_without_colour_is_one_of_the_camera(tmp_path):
+    deep = (np.arange(240 * 424) % 5000).astype("<u2").reshape(240, 424)
+    deep.tofile(tmp_path / "a_Depth_10.raw")
+    np.savetxt(tmp_path / "cam_K.txt", [[300, 0, 212], [0, 300, 120], [0, 0, 1]])
+    (frame,) = open_sequence(tmp_path)
+    np.testing.assert_allclose(frame.depth, deep / 1000, rtol=1e-6)
+
+
+def test_raw_depth_that_cannot_be_read_ends_in_one_sentence(tmp_path):
+    (tmp_path / "a_Depth_10.png").write_bytes(b"")
+    assert "rs-convert -r" in fault_of(tmp_path)
+    (tmp_path / "a_Depth_10.raw").write_bytes(bytes(1234))
+    assert "1,234 bytes" in fault_of(tmp_path)
+    np.savetxt(tmp_path / "cam_K.txt", [[300, 0, 212], [0, 300, 120], [0, 0, 1]])
+    (tmp_path / "a_Depth_10.raw").write_bytes(bytes(240 * 424 * 2))
+    (tmp_path / "a_Depth_20.raw").write_bytes(bytes(7))
+    assert "a_Depth_20.raw" in fault_of(tmp_path)

@@ -1,0 +1,94 @@
+"""RealSense recordings, as `rs-convert -r -p` unpacks a `.bag`: raw depth, images of colour."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from jaxshape import limits
+from jaxshape.data.sequences.errors import SequenceError
+from jaxshape.data.sequences.frames import FrameFiles
+from jaxshape.data.sequences.listing import Contents, Listed, with_colors_by_time
+from jaxshape.data.sequences.rasters import Stored, open_picture
+
+_SIZES = (
+    (1280, 720), (1024, 768), (848, 480), (640, 480), (640, 360), (480, 270), (424, 240),
+    (320, 240), (256, 144),
+)  # fmt: skip
+"""Width and height of the depth images of these cameras, each with another number of pixels."""
+
+_RAW, _PAINTED, _COLOR = (
+    re.compile(rf"(?:.*_)?{stem}_(\d+(?:\.\d*)?)\.{end}$", re.IGNORECASE)
+    for stem, end in (("Depth", "raw"), ("Depth", "png"), ("Color", "png"))
+)
+_Timed = list[tuple[float, Path]]
+
+
+def fits(contents: Contents) -> bool:
+    return bool(_timed(contents, _RAW) or _timed(contents, _PAINTED))
+
+
+def list_frames(contents: Contents) -> Listed:
+    """`NAME_Depth_MILLISECONDS.raw` of 16 bits in millimetres, `NAME_Color_MILLISECONDS.png`.
+
+    A raw file does not tell its width. It is that of the colour image, if depth was aligned to it,
+    or else of the one size of these cameras with as many pixels.
+    """
+    depth, color = _timed(contents, _RAW), _timed(contents, _COLOR)
+    if not depth:
+        has = (
+            "shows depth in colours only"
+            if _timed(contents, _PAINTED)
+            else "holds no NAME_Depth_TIME.raw"
+        )
+        raise SequenceError(
+            f"{contents.folder} {has}; unpack the .bag with rs-convert -r, which writes the depth "
+            "itself."
+        )
+    shape = _shape(depth[0][1], color)
+    times = np.array([time for time, _ in depth]) / 1000
+    offered = np.array([time for time, _ in color]) / 1000
+    images, delays = with_colors_by_time(times, offered, [path for _, path in color])
+    return Listed(
+        files=tuple(
+            FrameFiles(path.stem, _depth_image(path, shape), image, None)
+            for (_, path), image in zip(depth, images, strict=True)
+        ),
+        depth_scale=1000.0,
+        times=times,
+        color_delays=delays if color else None,
+    )
+
+
+def _timed(contents: Contents, pattern: re.Pattern[str]) -> _Timed:
+    """The files whose names match, with the milliseconds in their names, by time."""
+    found = ((pattern.match(name), name) for name in contents.files)
+    return sorted((float(match[1]), contents.folder / name) for match, name in found if match)
+
+
+def _shape(path: Path, color: _Timed) -> tuple[int, int]:
+    """Height and width of a raw depth image."""
+    pixels = path.stat().st_size / 2
+    sizes = list(_SIZES)
+    if color:
+        try:
+            with open_picture(color[0][1], limits.COLOR_PIXELS) as image:
+                sizes.insert(0, (image.width, image.height))
+        except (OSError, ValueError, Image.DecompressionBombError):
+            pass  # reading the frame says what is wrong with it
+    for width, height in sizes:
+        if width * height == pixels:
+            return height, width
+    raise SequenceError(
+        f"{path} holds {path.stat().st_size:,} bytes, which no depth image of a RealSense camera"
+        " has; save depth as 16-bit PNG files in a folder depth/."
+    )
+
+
+def _depth_image(path: Path, shape: tuple[int, int]) -> Path | Stored:
+    """The image in a file; the file itself where its length is another, so that reading fails."""
+    try:
+        return Stored(str(path), np.memmap(path, "<u2", "r", shape=shape))
+    except (OSError, ValueError):
+        return path
