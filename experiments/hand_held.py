@@ -32,19 +32,12 @@ from jaxshape.data.render import render_depth
 from jaxshape.data.sequences import open_sequence
 from jaxshape.files import write_json
 from jaxshape.geometry.camera import Intrinsics
-from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.map.doubts import doubts_of, unseen_of
-from jaxshape.mapping.map.mapper import Mapper, build_mapper
-from jaxshape.mapping.map.recording import Progress, follow
+from jaxshape.mapping.map.mapper import Mapper
 from jaxshape.mapping.placement.finding import find_start
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model.shapes import ShapePrior
-from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
-from jaxshape.results.output import only, shape_mesh
-from jaxshape.results.progress import floor_height, observation_of, seen_views
-from jaxshape.results.verdict import judged, quality_of
-from jaxshape.search.config import RefineConfig
+from rebuilding import judgement, rebuilt, usual
 
 RESULTS = Path(__file__).parent / "results"
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
@@ -87,8 +80,7 @@ def run(config: Config) -> dict[str, Any]:
     path = config.results / "hand_held.json"
     settings = {"seats": config.seats, "frames": config.frames, "meshes": config.meshes.name}
     done = _earlier(path, settings)
-    placer, prior = load_prior("chair-autoencoder"), load_prior()
-    mapper = build_mapper(prior, None, RefineConfig(), MappingConfig(), TrackingConfig())
+    placer, mapper = usual()
     for source in _chosen(config):
         if source.name not in done:
             done[source.name] = _rebuilt(source, config.frames, mapper, placer)
@@ -150,15 +142,11 @@ def _rebuilt(
         seen = record(Path(folder), model.mesh, frames, seed=len(source.name))
         sequence = open_sequence(seen.folder)
         start = find_start(sequence, placer, Prompt(click=seen.click))
-        *_, progress = follow(sequence, start, mapper, placer, use_poses=True)
-        state, shape = mapper.finish(progress.state)
-    progress = progress._replace(state=state, shape=shape)
+        progress = rebuilt(sequence, start, placer, mapper, use_poses=True)
     return {
         "sides": sides_of(progress.start.box, seen).round(4).tolist(),
-        "size": progress.start.box.size.round(4).tolist(),
         "true_size": seen.size.round(4).tolist(),
-        "warnings": [*progress.start.warnings, *doubts_of(progress)],
-        **_judged(progress),
+        **judgement(progress),
         "cpu_seconds": round(time.process_time() - began, 1),
     }
 
@@ -170,24 +158,6 @@ def sides_of(box: Box, seen: Recorded) -> np.ndarray:
     found = (world - T_WORLD_OBJECT[:3, 3]) @ T_WORLD_OBJECT[:3, :3] - seen.middle
     lower, upper = found.min(axis=0) + seen.size / 2, found.max(axis=0) - seen.size / 2
     return np.concatenate([lower, upper])
-
-
-def _judged(progress: Progress) -> dict[str, Any]:
-    observation = observation_of(progress.state)
-    one = only(progress.shape)
-    found = shape_mesh(observation, one.composed, one.fill_logits)
-    quality = quality_of(
-        found.mesh,
-        found.measured,
-        seen_views(progress.state),
-        axial=observation.sensor.axial,
-        is_mirrored=bool(one.symmetric),
-        floor=floor_height(progress.start),
-        unseen=unseen_of(progress),
-    )
-    verdict = judged(quality)
-    figures = {k: v for k, v in quality._asdict().items() if k != "size"}
-    return {"verdict": verdict.word, "reasons": verdict.reasons, "quality": figures}
 
 
 # The recording ----------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
     python tests/kills.py --kills 50            # make kills
 
-Each of dataset, train, evaluate and reconstruct runs once undisturbed. Then it is killed (SIGKILL,
+Each of dataset, train, evaluate, bench, reconstruct and scene runs once undisturbed. Then it is killed (SIGKILL,
 so that nothing can be put in order) after a random time, given again, killed again, until so many
 kills are spent; then it is left to end. The results have to be the same to the last bit, apart from
 times. About a minute for each kill on two cores, most of it for compiling what was not kept.
@@ -29,7 +29,15 @@ from safetensors.numpy import load_file
 from jaxshape.model.weights import save_prior
 
 SIZES = "--preset autoencoder --encoder 4 8 --decoder 8 --code 10".split()
-TIMES = ("seconds", "training_seconds", "samples_per_second", "command", "source")
+TIMES = (
+    "seconds",
+    "training_seconds",
+    "samples_per_second",
+    "compiling",
+    "load",
+    "command",
+    "source",
+)
 """Entries that may differ: times, and where things lie."""
 
 
@@ -46,7 +54,12 @@ def commands(at: Path) -> dict[str, tuple[list[str], str]]:
         "dataset": (made, "dataset"),
         "train": ([*trained, *SIZES], "train"),
         "evaluate": ([*scored, "--weights", known], "evaluate.json"),
+        "bench": (
+            "bench --methods cma,gradient:sgd --objects 3 --frames 4 --budget 64 --at-a-time 2".split(),
+            "board",
+        ),
         "reconstruct": (["reconstruct", str(frames), "--weights", known, *box, *found], "result"),
+        "scene": (["scene", str(frames)], "scene"),
     }
 
 

@@ -1,0 +1,61 @@
+"""Rebuild the object of a recording as `jaxshape reconstruct` does, and judge the result."""
+
+from typing import Any
+
+from jaxshape.data.sequences import Sequence
+from jaxshape.mapping.config import MappingConfig, TrackingConfig
+from jaxshape.mapping.map.doubts import doubts_of, unseen_of
+from jaxshape.mapping.map.mapper import Mapper, build_mapper
+from jaxshape.mapping.map.recording import Progress, follow
+from jaxshape.mapping.placement.finding import Start
+from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.weights import load_prior
+from jaxshape.results.output import only, shape_mesh
+from jaxshape.results.progress import floor_height, observation_of, seen_views
+from jaxshape.results.verdict import judged, quality_of
+from jaxshape.search.config import RefineConfig
+
+
+def usual() -> tuple[ShapePrior, Mapper]:
+    """The prior that places chairs, and the mapper, both as they are by default."""
+    mapper = build_mapper(load_prior(), None, RefineConfig(), MappingConfig(), TrackingConfig())
+    return load_prior("chair-autoencoder"), mapper
+
+
+def rebuilt(
+    sequence: Sequence,
+    start: Start,
+    placer: ShapePrior,
+    mapper: Mapper,
+    *,
+    use_poses: bool,
+    chosen: range | None = None,
+) -> Progress:
+    """Follow a recording to its end and finish its map; `chosen` frames of it, or all."""
+    *_, progress = follow(sequence, start, mapper, placer, use_poses=use_poses, chosen=chosen)
+    state, shape = mapper.finish(progress.state)
+    return progress._replace(state=state, shape=shape)
+
+
+def judgement(progress: Progress) -> dict[str, Any]:
+    """What the report says of a result: size, warnings, verdict, reasons, figures of quality."""
+    assert progress.shape is not None
+    observation, one = observation_of(progress.state), only(progress.shape)
+    found = shape_mesh(observation, one.composed, one.fill_logits)
+    quality = quality_of(
+        found.mesh,
+        found.measured,
+        seen_views(progress.state),
+        axial=observation.sensor.axial,
+        is_mirrored=bool(one.symmetric),
+        floor=floor_height(progress.start),
+        unseen=unseen_of(progress),
+    )
+    verdict = judged(quality)
+    return {
+        "size": progress.start.box.size.round(4).tolist(),
+        "warnings": [*progress.start.warnings, *doubts_of(progress)],
+        "verdict": verdict.word,
+        "reasons": verdict.reasons,
+        "quality": {k: v for k, v in quality._asdict().items() if k != "size"},
+    }
