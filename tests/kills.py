@@ -2,10 +2,11 @@
 
     python tests/kills.py --kills 50            # make kills
 
-Each of dataset, train, evaluate, bench, reconstruct and scene runs once undisturbed. Then it is killed (SIGKILL,
-so that nothing can be put in order) after a random time, given again, killed again, until so many
-kills are spent; then it is left to end. The results have to be the same to the last bit, apart from
-times. About a minute for each kill on two cores, most of it for compiling what was not kept.
+Each of dataset, train, evaluate, bench, reconstruct and scene runs once undisturbed. Then it is
+killed (SIGKILL, so that nothing can be put in order) after a random time, given again, killed
+again, until so many kills are spent; then it is left to end. The results have to be the same to the
+last bit, apart from times. About a minute for each kill on two cores, most of it for compiling what
+was not kept.
 """
 
 import argparse
@@ -48,16 +49,14 @@ def commands(at: Path) -> dict[str, tuple[list[str], str]]:
     data = str(at / "whole" / "dataset")
     trained = ["train", "--dataset", data, "--steps", "60", "--report-every", "5", "--batch", "2"]
     scored = "evaluate --count 24 --frames 1,2 --methods encoder,cma --iterations 3".split()
+    searched = "bench --methods cma,gradient:sgd --objects 3 --frames 4".split()
     found = "--iterations 3 --keyframe-iterations 2 --min-hits 1".split()
     box = ["--box", str(frames / "box.json"), "--poses", "first"]
     return {
         "dataset": (made, "dataset"),
         "train": ([*trained, *SIZES], "train"),
         "evaluate": ([*scored, "--weights", known], "evaluate.json"),
-        "bench": (
-            "bench --methods cma,gradient:sgd --objects 3 --frames 4 --budget 64 --at-a-time 2".split(),
-            "board",
-        ),
+        "bench": ([*searched, "--budget", "64", "--at-a-time", "2"], "board"),
         "reconstruct": (["reconstruct", str(frames), "--weights", known, *box, *found], "result"),
         "scene": (["scene", str(frames)], "scene"),
     }

@@ -4,10 +4,15 @@ The paper (section 4.2) is given the first pose by hand. Here the prior finds it
 around the measured points, the object's own is that in which the network explains them best. In a
 level world a box has seven numbers: its turn about the vertical and two opposite corners.
 
-    propose    boxes with their fronts all around, that reach more or less far into the unseen
-    encoded    the code that the encoder gives for the points in each box
-    improve    boxes and codes, moved together down the gradient of their misfit
-    place      all of it: the best box, and by how much it is better than one turned otherwise
+    propose     boxes with their fronts all around, that reach more or less far into the unseen
+    encode      the shape that the network makes of the points in each box
+    fit         the boxes of the best, moved down the gradient of their misfit, the shapes held
+    encode, fit once more, in the boxes that were found
+    improve     the best few, boxes and codes together
+    place       all of it: the best box, and by how much it is better than one turned otherwise
+
+To move a box costs a tenth of moving it with its code, and a code that is encoded anew follows a
+box further than its gradient does.
 
 Boxes are compared by how well points are explained, always the same ones: Eq. 7, a mean over
 voxels, would favour boxes with much free space in them.
@@ -23,15 +28,16 @@ import jax.numpy as jnp
 import jaxlie
 from jax import lax
 from jax.scipy.ndimage import map_coordinates
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxshape import checks
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.grid import MARGIN
 from jaxshape.geometry.grids import Grids
-from jaxshape.mapping.placement.race import race
+from jaxshape.mapping.placement.descent import descend
 from jaxshape.mapping.placement.rays import RaySamples
 from jaxshape.model.shapes import ShapePrior, decode_prepared, encode, pick
+from jaxshape.search.batching import select
 from jaxshape.search.refiner import finite_or_inf
 from jaxshape.search.space import whitened
 
@@ -47,19 +53,21 @@ class PlacementConfig:
         yaws: Directions of the front to start from, evenly spaced, 1 or more.
         overhangs: Distances by which boxes reach beyond the measured points where they face away
             from the camera, in typical sizes, 0 or more.
-        kept: Boxes that are improved, of all those proposed, 1 or more.
-        steps: Steps of Adam that improve the two best boxes, 1 or more; the others take a fifth.
+        tried: Boxes that are moved with their shapes held, of all those proposed, 1 or more.
+        kept: Boxes that are improved with their codes, of those tried, 1 or more.
+        steps: Steps of Adam that improve each box and its code, 1 or more.
         steps_again: Steps of Adam where an earlier placement is known, 1 or more.
 
     Raises:
-        ValueError: A setting is outside its range, or more boxes are kept than proposed.
+        ValueError: A setting is outside its range, or more boxes are kept than tried or proposed.
     """
 
     typical_size: tuple[float, float, float] = (0.58, 0.86, 0.60)
     size_spread: tuple[float, float, float] = (0.34, 0.21, 0.29)
     yaws: int = 24
     overhangs: tuple[float, ...] = (0.0, 0.2, 0.5)
-    kept: int = 8
+    tried: int = 24
+    kept: int = 4
     steps: int = 60
     steps_again: int = 25
 
@@ -70,12 +78,11 @@ class PlacementConfig:
         checks.whole("yaws", self.yaws, 1)
         for overhang in self.overhangs:
             checks.at_least("overhangs", overhang, 0)
-        for name in ("kept", "steps", "steps_again"):
+        for name in ("tried", "kept", "steps", "steps_again"):
             checks.whole(name, getattr(self, name), 1)
-        proposed = 1 + self.yaws * len(self.overhangs)
-        if self.kept > proposed:
-            wanted = f"at most the {proposed} boxes that yaws and overhangs propose"
-            checks.refuse("kept", self.kept, wanted)
+        tried = min(self.tried, 1 + self.yaws * len(self.overhangs))
+        if self.kept > tried:
+            checks.refuse("kept", self.kept, f"at most the {tried} boxes that are tried")
 
 
 COMPARED_POINTS = 2048
@@ -97,8 +104,11 @@ OUTLIERS = 0.03
 EMPTY = -8.0
 """Logit outside the grid."""
 
-OTHERWISE = jnp.pi / 6
-"""Yaws further apart than this, in radians, are different answers."""
+OTHERWISE, APART = jnp.pi / 6, jnp.pi / 18
+"""Yaws further apart than this, in radians, are different answers, and are improved separately."""
+
+FIT_STEPS = 15
+"""Steps of Adam with which a box is fitted to a shape that is held."""
 
 
 class UprightBox(NamedTuple):
@@ -277,39 +287,79 @@ def place(
     seen = seen._replace(surface=seen.surface - center, free=seen.free - center)
     floor = floor - center[1]
     space, n = whitened(prior), prior.resolution
+    width = 0.015 * jnp.array(config.typical_size)
+    unit = UprightBox(jnp.float32(0.02), width.at[1].multiply(jnp.isnan(floor)), width)
+    fits = jax.vmap(partial(misfit, seen=seen, config=config))
 
     def holds(box, points):
         return fusion.count_points(to_voxels(box, points, n), n) > 0
 
+    def encoded(boxes):
+        occupied = jax.vmap(holds, (0, None))(boxes, seen.surface)
+        occluded = ~(occupied | jax.vmap(holds, (0, None))(boxes, seen.free))
+        grids = Grids(occupied, occluded)
+        decoder = prior.model.prepare(prior.params, grids, "float32")
+        return encode(prior, grids), decoder
+
+    def judged(boxes, codes, decoder):
+        logits = decode_prepared(prior.model, decoder, codes)
+        hypothesis = Hypothesis(boxes, jax.vmap(space.from_code)(codes))
+        total = finite_or_inf(fits(logits, boxes) + unlikely(hypothesis.point))
+        return _Candidate(hypothesis, decoder.own, logits, total)
+
+    def fitted(candidates):
+        held = lambda boxes: fits(candidates.logits, boxes)  # noqa: E731
+        boxes, fit = descend(candidates.hypothesis.box, held, _longer(unit), FIT_STEPS, rise=3)
+        hypothesis = candidates.hypothesis._replace(box=boxes)
+        total = fit + unlikely(hypothesis.point)
+        return candidates._replace(hypothesis=hypothesis, misfit=total)
+
     boxes = propose(seen, floor, config)
     earlier = _standing(_box_of(known, center), floor)
     boxes = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), earlier, boxes)
-    occupied = jax.vmap(holds, (0, None))(boxes, seen.surface)
-    occluded = ~(occupied | jax.vmap(holds, (0, None))(boxes, seen.free))
-    grids = Grids(occupied, occluded)
-    codes = encode(prior, grids).at[0].set(known.code)
-    proposed = Hypothesis(boxes, jax.vmap(space.from_code)(codes))
-    decoder = prior.model.prepare(prior.params, grids, "float32")
+    codes, decoder = encoded(boxes)
+    tried = judged(boxes, codes.at[0].set(known.code), decoder)
+    tried = fitted(pick(tried, jnp.argsort(tried.misfit)[: config.tried]))
+    again = judged(tried.hypothesis.box, *encoded(tried.hypothesis.box))
+    tried = fitted(jax.vmap(select)(again.misfit < tried.misfit, again, tried))
 
-    def misfits(hypothesis, decoder):
-        codes = jax.vmap(space.to_code)(hypothesis.point)
-        logits = decode_prepared(prior.model, decoder, codes)
-        fit = jax.vmap(partial(misfit, seen=seen, config=config))(logits, hypothesis.box)
-        return fit + CODE_WEIGHT * 0.5 * jnp.sum(hypothesis.point**2, axis=-1)
+    best = pick(tried, _most_promising(tried, config.kept))
+    shared = decoder._replace(own=best.own)
 
-    first = finite_or_inf(misfits(proposed, decoder))
-    chosen = _most_promising(first, config)
+    def misfits(hypothesis):
+        logits = decode_prepared(prior.model, shared, jax.vmap(space.to_code)(hypothesis.point))
+        return fits(logits, hypothesis.box) + unlikely(hypothesis.point)
 
-    def of_chosen(hypothesis, those):
-        own = pick(decoder.own, chosen[those])
-        return misfits(hypothesis, decoder._replace(own=own))
-
-    width = 0.015 * jnp.array(config.typical_size)
-    on_floor = width.at[1].multiply(jnp.isnan(floor))
-    unit = Hypothesis(UprightBox(jnp.float32(0.02), on_floor, width), jnp.float32(0.1))
     steps = jnp.where(jnp.isnan(known.misfit), config.steps, config.steps_again)
-    improved, after = race(pick(proposed, chosen), of_chosen, unit, steps, _finalists)
-    return _best_of(improved, after, center, space.to_code)
+    whole = Hypothesis(unit, jnp.float32(0.1))
+    improved, lowest = descend(best.hypothesis, misfits, whole, steps, rise=8)
+    return _best_of(improved, lowest, center, space.to_code)
+
+
+class _Candidate(NamedTuple):
+    """A hypothesis, and what is known of it.
+
+    Attributes:
+        hypothesis: The box and the code.
+        own: Features of what was measured in the box, of a decoder that has them.
+        logits: The shape in the box.
+        misfit: Misfit of the hypothesis, infinite where it is not finite.
+    """
+
+    hypothesis: Hypothesis
+    own: PyTree
+    logits: Float[Array, "*batch x y z"]
+    misfit: Float[Array, "*batch"]
+
+
+def unlikely(point: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
+    """The part of the misfit that a code has by itself, given as a point of the whitened space."""
+    return CODE_WEIGHT * 0.5 * jnp.sum(point**2, axis=-1)
+
+
+def _longer(unit: UprightBox) -> UprightBox:
+    """The unit of steps with which boxes alone are moved, of which there are few."""
+    return jax.tree.map(lambda x: 1.5 * x, unit)
 
 
 def nothing_known(prior: ShapePrior) -> Placement:
@@ -326,29 +376,18 @@ def _box_of(known: Placement, center: Float[Array, " 3"]) -> UprightBox:
     return UprightBox(yaw, middle - known.size / 2, middle + known.size / 2)
 
 
-def _most_promising(misfits: Float[Array, " h"], config: PlacementConfig) -> Int[Array, " k"]:
-    """Indices of the boxes to improve: those that no neighbour in yaw outdoes, then the others.
+def _most_promising(tried: _Candidate, count: int) -> Int[Array, " k"]:
+    """Indices of the best boxes, no two of which look the same way as long as there are others."""
+    yaw, misfits = tried.hypothesis.box.yaw, tried.misfit
 
-    The first one is the earlier placement, the others come yaw by yaw.
-    """
-    by_yaw = misfits[1:].reshape(-1, config.yaws)
-    neighbours = jnp.minimum(jnp.roll(by_yaw, 1, axis=1), jnp.roll(by_yaw, -1, axis=1))
-    outdone = jnp.concatenate([jnp.array([False]), (by_yaw > neighbours).ravel()])
-    return jnp.lexsort((misfits, outdone))[: config.kept]
+    def add(i, carry):
+        chosen, is_left, is_new = carry
+        best = jnp.lexsort((misfits, ~is_new, ~is_left))[0]
+        is_new &= jnp.cos(yaw - yaw[best]) < jnp.cos(APART)
+        return chosen.at[i].set(best), is_left.at[best].set(False), is_new
 
-
-def _finalists(hypotheses: Hypothesis, misfits: Float[Array, " h"]) -> Int[Array, " 2"]:
-    """The best box, and the best of those that are turned otherwise, or the next best."""
-    best = jnp.argmin(misfits)
-    apart = _turned_otherwise(hypotheses.box, best)
-    itself = jnp.arange(len(misfits)) == best
-    rival = jnp.lexsort((misfits, ~apart, jnp.isinf(misfits), itself))[0]
-    return jnp.stack([best, rival])
-
-
-def _turned_otherwise(boxes: UprightBox, one: Int[Array, ""]) -> Bool[Array, " h"]:
-    """True for boxes whose fronts are far from that of one of them."""
-    return jnp.cos(boxes.yaw - boxes.yaw[one]) < jnp.cos(OTHERWISE)
+    everything = jnp.ones(len(yaw), bool)
+    return lax.fori_loop(0, count, add, (jnp.zeros(count, int), everything, everything))[0]
 
 
 def _best_of(
@@ -359,7 +398,7 @@ def _best_of(
 ) -> Placement:
     best = jnp.argmin(misfits)
     box, point = jax.tree.map(lambda x: x[best], hypotheses)
-    apart = _turned_otherwise(hypotheses.box, best)
+    apart = jnp.cos(hypotheses.box.yaw - box.yaw) < jnp.cos(OTHERWISE)
     other = jnp.min(misfits, where=apart, initial=jnp.inf)
     R_world_object = jaxlie.SO3.from_y_radians(box.yaw)
     middle = R_world_object @ ((box.lower + box.upper) / 2) + center

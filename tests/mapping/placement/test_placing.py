@@ -139,25 +139,14 @@ def test_misfit_depends_on_neither_units_nor_the_world():
 # ------------------------------------------------------------------------ the search
 
 
-def test_the_earlier_box_and_the_best_of_each_direction_come_first():
-    config = PlacementConfig(yaws=6, overhangs=(0.0, 0.5), kept=4)
-    by_yaw = jnp.array([[5.0, 1.0, 2.0, 9.0, 4.0, 6.0], [7.0, 7.5, 8.0, 3.0, 5.5, 9.5]])
-    chosen = placing._most_promising(jnp.array([10.0, *by_yaw.ravel()]), config)
-    assert [int(i) for i in chosen] == [2, 10, 5, 7]  # 1, 3 and 4 have no better neighbour; then 7
-    chosen = placing._most_promising(jnp.array([0.5, *by_yaw.ravel()]), config)
-    assert chosen[0] == 0
-
-
-def test_the_rival_of_the_best_box_is_turned_otherwise_where_one_is():
-    yaws = jnp.array([0.0, 0.1, 3.0, 3.1])
-    boxes = Hypothesis(UprightBox(yaws, jnp.zeros((4, 3)), jnp.ones((4, 3))), jnp.zeros((4, 2)))
-    chosen = placing._finalists(boxes, jnp.array([1.0, 1.1, 1.4, 1.3]))
-    assert [int(i) for i in chosen] == [0, 3]
-    chosen = placing._finalists(boxes, jnp.array([1.1, 1.0, jnp.inf, jnp.inf]))
-    assert [int(i) for i in chosen] == [1, 0]
-    near = boxes._replace(box=boxes.box._replace(yaw=jnp.array([0.0, 0.1, 0.2, 0.3])))
-    chosen = placing._finalists(near, jnp.array([1.4, 1.3, 1.0, 1.1]))
-    assert [int(i) for i in chosen] == [2, 3]
+def test_the_best_boxes_are_improved_and_no_two_that_look_the_same_way():
+    yaws, misfits = jnp.array([0.0, 0.1, 3.0, 3.1, 1.0]), jnp.array([1.0, 1.1, 1.4, 1.3, jnp.inf])
+    boxes = Hypothesis(UprightBox(yaws, jnp.zeros((5, 3)), jnp.ones((5, 3))), jnp.zeros((5, 2)))
+    tried = placing._Candidate(boxes, (), jnp.zeros((5, 1, 1, 1)), misfits)
+    chosen = placing._most_promising(tried, 3)
+    assert [int(i) for i in chosen] == [0, 3, 4]
+    chosen = placing._most_promising(tried, 5)  # then those that look the same way
+    assert [int(i) for i in chosen] == [0, 3, 4, 1, 2]
 
 
 @pytest.fixture(scope="module")
