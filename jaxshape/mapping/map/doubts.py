@@ -20,6 +20,9 @@ from jaxshape.mapping.placement.finding import Start
 LEGS = 0.15
 """Share of the height of the box, from below, that legs take up at least."""
 
+LEFT_OUT = 0.15
+"""Share of what the first frame showed as the object from which its absence in the map is said."""
+
 _LOWEST = 0.5  # percent of the points that may lie below what counts as measured
 
 
@@ -40,8 +43,8 @@ ALL_SEEN = Unseen()
 
 
 def doubts_of(progress: Progress) -> tuple[str, ...]:
-    """Warnings of frames that cannot be read, and of what was not seen of the object: in keyframes,
-    of its box and of its legs.
+    """Warnings of frames that cannot be read, of keyframes without the object, of what its box left
+    out, and of what was not seen of its box and its legs.
 
     Args:
         progress: Progress of a recording.
@@ -49,7 +52,12 @@ def doubts_of(progress: Progress) -> tuple[str, ...]:
     Returns:
         A sentence for each; none about a box that was given.
     """
-    return (*unreadable(progress), *_empty(progress), *unseen_in_words(progress))
+    return (
+        *unreadable(progress),
+        *_empty(progress),
+        *_left_out(progress),
+        *unseen_in_words(progress),
+    )
 
 
 def unseen_in_words(progress: Progress) -> tuple[str, ...]:
@@ -103,6 +111,20 @@ def _empty(progress: Progress) -> tuple[str, ...]:
     if not names:
         return ()
     return (f"No pixel was taken for the object in {_named(names)}; nothing of that is fused.",)
+
+
+def _left_out(progress: Progress) -> tuple[str, ...]:
+    """Whether much that was chosen in the first frame is not the object of the map."""
+    first = progress.state.keyframes[0]
+    if progress.start.T_level_world is None or first.parts is None or not first.parts.sure.any():
+        return ()
+    share = 1 - float(np.asarray(first.segmented)[first.parts.sure].mean())
+    if share < LEFT_OUT:
+        return ()
+    return (
+        f"{share:.0%} of what was taken for the object in the first frame lies outside of its box: "
+        "the object is larger than the prior's, or something else touches it.",
+    )
 
 
 def _faces(start: Start, views: list[Cutout]) -> tuple[str, ...]:

@@ -109,3 +109,16 @@ def test_what_was_not_seen_is_said(recorded):
     said = " ".join(doubts_of(steps[-1]))
     assert "No pixel was taken for the object in frame-000005" in said
     assert "lowest" not in said and "top" not in said
+
+
+def test_what_the_box_leaves_out_of_the_first_frame_is_said(recorded):
+    _, steps = recorded([FAR[0], FAR[1]])
+    last = steps[-1]
+    assert "first frame" not in " ".join(doubts_of(last))
+    first, *others = last.state.keyframes
+    rows = jnp.arange(first.segmented.shape[0])[:, None]
+    upper = first.segmented & (rows < jnp.median(jnp.nonzero(first.segmented)[0]))
+    cut = last.state._replace(keyframes=(first._replace(segmented=upper), *others))
+    said = " ".join(doubts_of(last._replace(state=cut)))
+    share = int(said.split("% of what was taken for the object in the first frame")[0][-2:])
+    assert 40 < share < 65
