@@ -1,10 +1,11 @@
 """Which parts of many frames are the object, decided together. [host]
 
-A part of one frame belongs to the object if it lies in the object's box, or if it shows again what
-is known to be the object and ends within the prior's reach: so that a box which was cut too short
-does not exclude what it should have held. So does a part that two frames show together with the
-object: the seat below a back that was all that the first frame showed. Parts that other frames show
-apart from the object, or that go on beyond its reach, are something else.
+A part of one frame belongs to the object if it lies in the object's box and next to, above or below
+what is known of the object, or if it shows again what is known to be the object and ends within the
+prior's reach: so that a box which was cut too short does not exclude what it should have held, and
+one that reaches too far does not hold the table beside. So does a part that two frames show
+together with the object: the seat below a back that was all that the first frame showed. Parts that
+other frames show apart from the object, or that go on beyond its reach, are something else.
 """
 
 from typing import NamedTuple
@@ -25,6 +26,9 @@ MOSTLY, WHOLLY = 0.5, 0.95
 
 AGAIN = 0.1
 """Share of a part that was measured before, as the object, to be the object seen again."""
+
+BESIDE, ALONG = 0.06, 1.0
+"""Metres, sideways and along the vertical, within which a part adjoins the object."""
 
 FOREIGN = 0.2
 """Share of a part above which measurements of other things cut it."""
@@ -83,10 +87,13 @@ class _Known(NamedTuple):
     Attributes:
         ours: Points of the object.
         others: Points of other things.
+        columns: Points of the object in the frame of its box, low in height, so that what is above
+            and below them is near.
     """
 
     ours: KDTree
     others: KDTree
+    columns: KDTree
 
 
 def belonging(
@@ -107,12 +114,14 @@ def belonging(
     parts = [part for i, seen in enumerate(frames) for part in _parts(i, seen, box, reach, column)]
     sure = [seen.points[seen.sure & points_in_box(seen.points, reach)] for seen in frames]
     background = [_background(seen, column) for seen in frames]
-    known, whole, clouds = _Known(_tree(sure), _tree(background)), set(), sure
+    known = _Known(_tree(sure), _tree(background), _columns(sure, box))
+    whole, clouds = set(), sure
     for _ in range(ROUNDS):
-        ours = [part for part in parts if _is_ours(part, known.ours)]
+        ours = [part for part in parts if _is_ours(part, known, box)]
         if beside := _together(parts, ours, whole, frames):
-            known = known._replace(ours=_tree([*clouds, *(part.points for part in beside)]))
-            ours = [part for part in parts if _is_ours(part, known.ours)]
+            more = [*clouds, *(part.points for part in beside)]
+            known = known._replace(ours=_tree(more), columns=_columns(more, box))
+            ours = [part for part in parts if _is_ours(part, known, box)]
         taken = {part[:2] for part in ours}
         apart = [part for part in parts if part[:2] not in taken and _is_apart(part)]
         known = known._replace(others=_tree([*background, *(part.points for part in apart)]))
@@ -120,7 +129,7 @@ def belonging(
         if whole == before:
             break
         clouds = [*sure, *(part.points for part in ours if part[:2] in whole)]
-        known = known._replace(ours=_tree(clouds))
+        known = known._replace(ours=_tree(clouds), columns=_columns(clouds, box))
     found = [
         _pixels(seen, [p for p in ours if p.frame == i], whole, known, box, reach)
         for i, seen in enumerate(frames)
@@ -128,13 +137,31 @@ def belonging(
     return _with_specks(frames, found, known, reach)
 
 
-def _is_ours(part: _Part, ours: KDTree) -> bool:
+def _is_ours(part: _Part, known: _Known, box: Box) -> bool:
     """Whether a part is the object, all of it or some.
 
     What may be the corner of something nearer is so only if other frames show it as the object.
     """
-    again = float(_near(part.points, ours).mean())
-    return again > MOSTLY if part.is_corner else part.in_box > MOSTLY or again > AGAIN
+    again = float(_near(part.points, known.ours).mean())
+    if part.is_corner:
+        return again > MOSTLY
+    return again > AGAIN or (part.in_box > MOSTLY and _adjoins(part, known.columns, box))
+
+
+def _adjoins(part: _Part, columns: KDTree, box: Box) -> bool:
+    """Whether some of a part lies next to, above or below the object."""
+    away, _ = columns.query(_flat(part.points, box), distance_upper_bound=BESIDE)
+    return float(np.isfinite(away).mean()) > AGAIN
+
+
+def _columns(clouds: list[Float[np.ndarray, "_ 3"]], box: Box) -> KDTree:
+    return _tree([_flat(points, box) for points in clouds])
+
+
+def _flat(points: Float[np.ndarray, "n 3"], box: Box) -> Float[np.ndarray, "n 3"]:
+    """Points in the frame of the box, its height scaled so that `ALONG` is as far as `BESIDE`."""
+    own = (points - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
+    return own * (1.0, BESIDE / ALONG, 1.0)
 
 
 def _together(

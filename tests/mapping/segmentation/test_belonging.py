@@ -71,6 +71,14 @@ def test_the_table_beside_is_not_the_chair_though_it_is_within_reach(views):
                for v, found in zip(views, found_in(views, SHORT), strict=True))  # fmt: skip
 
 
+def test_a_box_that_reaches_too_far_does_not_hold_the_table_beside(views):
+    wide = box_of((-0.25, 0, -0.6), (1.65, 0.96, 0.45))
+    for view, found in zip(views[1:], found_in(views, wide)[1:], strict=True):
+        chair = (view.label == OURS) & (in_the_world(view)[..., 1] > 0.06)
+        assert found[chair].mean() > 0.95
+        assert not found[view.label == ITS_TABLE].any()
+
+
 def open_back(gap):
     """The chair, its back so far above the seat that background shows between them."""
     seat, ((x, _, z), high), *legs = CHAIR
