@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-SCRIPTS = ["convergence", "iou_by_frames", "objective"]
-LONG = ["step_size", "voluminous", "gallery", "gradient_failures", "equal_budget"]
+SCRIPTS = ["iou_by_frames"]
+LONG = [
+    "convergence",
+    "objective",
+    "step_size",
+    "voluminous",
+    "gallery",
+    "gradient_failures",
+    "equal_budget",
+]
 
 
 def check_claims_of_iou(content):

@@ -1,5 +1,7 @@
 """Both ways of fusing frames keep the laws of merging, and agree with what they stand for."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -47,7 +49,7 @@ def test_fused_grids_do_not_depend_on_the_order_of_frames(fusing):
 
 @pytest.mark.parametrize("fusing", [Points(8), Distances(8, 32)])
 def test_no_frames_leave_everything_unknown(fusing):
-    grids = fusing.grids(fusing.nothing())
+    grids = jax.jit(fusing.grids)(fusing.nothing())
     assert not np.asarray(grids.occupied).any()
     assert np.asarray(grids.occluded).all()
 
@@ -55,8 +57,8 @@ def test_no_frames_leave_everything_unknown(fusing):
 def test_points_are_those_of_the_paper():
     depth, T = a_wall()[0], jaxlie.SE3(POSES.wxyz_xyz[0])
     one = (depth, jnp.isfinite(depth), CAMERA, T, frame_of(16))
-    found = Points(16, 2).grids(Points(16, 2).measure(*one))
-    expected = fusion.measure(*one, resolution=16)
+    found = jax.jit(lambda *one: Points(16, 2).grids(Points(16, 2).measure(*one)))(*one)
+    expected = jax.jit(partial(fusion.measure, resolution=16))(*one)
     np.testing.assert_array_equal(found.occupied, fusion.occupied(expected, 2))
     np.testing.assert_array_equal(found.occluded, fusion.occluded(expected, 2))
 
@@ -64,10 +66,13 @@ def test_points_are_those_of_the_paper():
 def test_distances_cover_the_same_box_at_every_resolution():
     depth, T = a_wall()[0], jaxlie.SE3(POSES.wxyz_xyz[0])
     seen = jnp.isfinite(depth)
-    coarse, fine = (Distances(n, 64).measure(depth, seen, CAMERA, T, frame_of(n)) for n in (16, 32))
+    coarse, fine = (
+        jax.jit(Distances(n, 64).measure)(depth, seen, CAMERA, T, frame_of(n)) for n in (16, 32)
+    )
     boxes = [frame_of(n).voxel_size * n for n in (16, 32)]
     np.testing.assert_allclose(boxes[0], boxes[1], rtol=0.2)  # margins are voxels
-    at_32 = distance.measure(depth, seen, CAMERA, T, frame_of(32), resolution=64)
+    measure = jax.jit(partial(distance.measure, resolution=64))
+    at_32 = measure(depth, seen, CAMERA, T, frame_of(32))
     np.testing.assert_array_equal(fine.weight, at_32.weight)
     assert soft_grids(coarse, 16).occupied.shape == (16, 16, 16)
 

@@ -1,16 +1,18 @@
 """The conditional network: each object's features stay its own, and codes are normal."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxshape.geometry.grids import Grids
-from jaxshape.model import completion
+from jaxshape.model import completion, shapes
 from jaxshape.model.completion import COMPLETION
 from jaxshape.model.config import Completion, TrainConfig
 from jaxshape.model.families import COMPLETIONS, Batch, completion_cost
-from jaxshape.model.shapes import ShapePrior, decode, decode_prepared, encode
+from jaxshape.model.shapes import ShapePrior, decode_prepared
 from jaxshape.model.weights import load_prior, save_prior
 
 SMALL = Completion(channels=(4, 6, 8), depth=1, code=5, resolution=16)
@@ -26,6 +28,13 @@ def params():
 @pytest.fixture(scope="module")
 def prior(params):
     return ShapePrior(COMPLETION, params, jnp.zeros(SMALL.code), jnp.eye(SMALL.code))
+
+
+decode, encode = jax.jit(shapes.decode), jax.jit(shapes.encode)
+
+
+def cost_of(config):
+    return jax.jit(partial(completion_cost, config=config, axis=None))
 
 
 def grids_of(count, seed=0):
@@ -87,7 +96,11 @@ def test_a_mirrored_measurement_gets_the_mirrored_answer(prior):
 
 def test_half_precision_is_close(prior):
     grids, code = grids_of(2), jax.random.normal(jax.random.key(1), (2, SMALL.code))
-    half = decode_prepared(COMPLETION, COMPLETION.prepare(prior.params, grids, "bfloat16"), code)
+    half = jax.jit(
+        lambda params: decode_prepared(
+            COMPLETION, COMPLETION.prepare(params, grids, "bfloat16"), code
+        )
+    )(prior.params)
     exact = decode(prior, code, grids)
     assert half.dtype == jnp.float32
     assert float(jnp.std(half - exact) / jnp.std(exact)) < 0.05
@@ -116,13 +129,14 @@ def test_the_cost_is_the_evidence_bound():
     surface = jnp.asarray(np.random.default_rng(2).random((4, 16, 16, 16)) < 0.2)
     batch = Batch(*(x.astype(jnp.float32) for x in grids[:2]), surface)
     noise = jax.random.normal(jax.random.key(3), (4, SMALL.code))
-    cost = completion_cost(variables, batch, noise, config, None)
+    cost = cost_of(config)(variables, batch, noise)
 
     params = variables["params"]
-    mean, log_variance = completion.posterior(params, batch.grids, surface)
+    mean, log_variance = jax.jit(completion.posterior)(params, batch.grids, surface)
     code = jnp.where((jnp.arange(4) % 2)[:, None] == 1, mean + jnp.exp(log_variance / 2) * noise, 0)
-    found = completion.skips(params, batch.grids)
-    p = np.asarray(jax.nn.sigmoid(completion.decode_skips(params, found, code)), np.float64)
+    found = jax.jit(completion.skips)(params, batch.grids)
+    logits = jax.jit(completion.decode_skips)(params, found, code)
+    p = np.asarray(jax.nn.sigmoid(logits), np.float64)
     entropy = -np.log(np.where(surface, p, 1 - p)).mean()
     # Of normal distributions, by sampling.
     draws = np.random.default_rng(0).normal(size=(20_000, 4, SMALL.code))
@@ -144,7 +158,7 @@ def test_a_share_of_the_batch_decodes_posterior_codes(share, searched):
     def loss_by_example(noise):
         return completion_cost(variables, batch, noise, config, None).loss
 
-    slope = jax.grad(loss_by_example)(jnp.ones((4, SMALL.code)))
+    slope = jax.jit(jax.grad(loss_by_example))(jnp.ones((4, SMALL.code)))
     assert int((jnp.abs(slope).max(axis=1) > 0).sum()) == searched
 
 
@@ -156,7 +170,5 @@ def test_weights_of_voxels_count():
     plain = TrainConfig(SMALL, occupied_weight=1.0, occluded_weight=1.0, code_weight=0.0)
     heavy = TrainConfig(SMALL, occupied_weight=1.0, occluded_weight=3.0, code_weight=0.0)
     hidden = batch._replace(occluded=jnp.ones_like(batch.occluded))
-    once, thrice = (
-        completion_cost(variables, hidden, noise, config, None).loss for config in (plain, heavy)
-    )
+    once, thrice = (cost_of(config)(variables, hidden, noise).loss for config in (plain, heavy))
     np.testing.assert_allclose(3 * once, thrice, rtol=1e-5)

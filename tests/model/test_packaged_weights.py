@@ -49,7 +49,7 @@ def test_they_have_the_default_architecture_and_a_card(prior):
 
 
 def test_codes_of_chairs_lie_where_the_stored_statistics_say(prior, observed):
-    codes = encode(prior, Grids(*observed[:2])) - prior.code_mean
+    codes = jax.jit(encode)(prior, Grids(*observed[:2])) - prior.code_mean
     whitened = np.linalg.solve(np.linalg.cholesky(prior.code_covariance), np.asarray(codes).T)
     assert 0.3 < np.sqrt(np.mean(whitened**2)) < 3
 
@@ -124,6 +124,6 @@ def test_its_codes_move_what_is_hidden_and_little_else(chair, observed):
 
 def test_they_decode_to_stored_values(prior):
     """A change of format, layout or arithmetic would show here."""
-    logits = decode(prior, prior.code_mean)
+    logits = jax.jit(decode)(prior, prior.code_mean)
     expected = [-5.9285, -5.9050, -5.7864, -4.7429, -5.2473, -4.4433, -4.8925, -4.4301]
     np.testing.assert_allclose(logits[::8, 3::8, 5::8].ravel()[:8], expected, rtol=1e-3, atol=1e-3)

@@ -7,13 +7,14 @@ import pytest
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
+from jaxshape.model import shapes
 from jaxshape.model.pca import fit
-from jaxshape.model.shapes import decode, encode
 from jaxshape.model.weights import load_prior, save_prior
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
 
 N, COUNT = 8, 120
+decode, encode = jax.jit(shapes.decode), jax.jit(shapes.encode)
 
 
 def boxes(count, seed):
@@ -50,10 +51,10 @@ def test_the_components_are_numpys(prior):
 
 def test_a_complete_surface_is_projected(prior):
     """With all voxels known the first code is that of the projection, shrunk a little."""
-    shapes = jnp.asarray(boxes(5, 1))
-    codes = encode(prior, Grids(shapes, jnp.zeros_like(shapes)))
+    whole = jnp.asarray(boxes(5, 1))
+    codes = encode(prior, Grids(whole, jnp.zeros_like(whole)))
     components = np.asarray(prior.params["components"]).reshape(12, -1)
-    projected = (shapes.reshape(5, -1) - prior.params["mean"].ravel()) @ components.T
+    projected = (whole.reshape(5, -1) - prior.params["mean"].ravel()) @ components.T
     shrink = prior.params["variances"] / (prior.params["variances"] + prior.params["noise"])
     np.testing.assert_allclose(codes, projected * shrink, rtol=1e-3, atol=1e-3)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxshape.geometry.grids import Grids
+from jaxshape.model import shapes
 from jaxshape.model.calibration import UNCALIBRATED, Calibration
-from jaxshape.model.shapes import decode
 from jaxshape.search.calibrating import fit, fit_calibration
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.curvature import expand
@@ -19,14 +19,15 @@ from jaxshape.search.residuals import BALANCED
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 KEYS = jax.random.split(jax.random.key(0), 2)
+decode = jax.jit(shapes.decode)
 
 
 def test_narrowed_points_have_the_posterior_of_a_normal_prior_and_a_quadratic_loss():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 5))
     loss = lambda u: 0.5 * jnp.sum((jnp.float32(root) @ u) ** 2)  # noqa: E731
-    about = expand(loss, jnp.float32(rng.normal(size=5)), 5)
-    points = narrowed(about, 4.0, jnp.eye(5))
+    about = jax.jit(lambda u: expand(loss, u, 5))(jnp.float32(rng.normal(size=5)))
+    points = jax.jit(lambda about: narrowed(about, 4.0, jnp.eye(5)))(about)
     # Rows of the result are the square root of the covariance, which is symmetric.
     covariance = np.linalg.inv(np.eye(5) + 4 * root.T @ root)
     np.testing.assert_allclose(points @ points.T, covariance, atol=2e-5)
@@ -43,7 +44,9 @@ def test_samples_about_a_found_code_agree_on_what_was_measured(linear_prior):
     code = jax.random.normal(jax.random.key(1), (2, 10))
     grids = left_half_measured(linear_prior, code)
     targets = jax.vmap(BALANCED.target)(grids, jnp.zeros(grids.occupied.shape))
-    found = sample_codes(KEYS, linear_prior, grids, code, 64, residual=BALANCED, target=targets)
+    found = jax.jit(lambda *one: sample_codes(KEYS, *one, 64, residual=BALANCED, target=targets))(
+        linear_prior, grids, code
+    )
     assert found.shape == (2, 64, 10)
     deviation = jnp.std(found, axis=1)
     assert jnp.all(deviation < 0.5) and jnp.all(deviation > 0.001)  # the prior's is 1

@@ -30,7 +30,7 @@ def seen(frame):
 
 
 def depth_at(points, depth, intrinsics):
-    pixels, z = camera.project(intrinsics, points)
+    pixels, z = jax.jit(camera.project)(intrinsics, points)
     column, row = np.floor(np.asarray(pixels) + 1e-4).astype(int).T
     return np.asarray(z), np.asarray(depth)[row, column], (row, column)
 
@@ -67,7 +67,7 @@ def test_pooling_takes_as_much_of_each_frame_and_moves_it_to_the_world(seen):
         jaxlie.SO3.from_y_radians(jnp.array([0.0, np.pi])), jnp.array([[0.0, 0, 0], [0, 5, 0]])
     )
     two = jax.tree.map(lambda x: jnp.stack([x, x]), seen)
-    both = pooled(two, T_world_camera)
+    both = jax.jit(pooled)(two, T_world_camera)
     assert jax.tree.map(jnp.shape, both) == jax.tree.map(jnp.shape, seen)
     for points in (both.surface, both.free):
         is_second = points[:, 1] > 2
@@ -78,8 +78,8 @@ def test_pooling_takes_as_much_of_each_frame_and_moves_it_to_the_world(seen):
 
 def test_pooling_leaves_frames_without_the_object_out(seen, nothing):
     three = jax.tree.map(lambda x, y: jnp.stack([y, x, x]), seen, nothing)
-    found = pooled(three, jaxlie.SE3.identity((3,)))
+    found = jax.jit(pooled)(three, jaxlie.SE3.identity((3,)))
     np.testing.assert_allclose(found.away, seen.away, rtol=1e-6)
     assert set(np.asarray(found.surface).ravel()) <= set(np.asarray(seen.surface).ravel())
-    none = pooled(jax.tree.map(lambda x: x[None], nothing), jaxlie.SE3.identity((1,)))
+    none = jax.jit(pooled)(jax.tree.map(lambda x: x[None], nothing), jaxlie.SE3.identity((1,)))
     assert jnp.isnan(none.surface).all()

@@ -88,13 +88,15 @@ def test_the_curvature_of_a_network_is_that_of_its_differences(prior):
     batch = jax.jit(jax.vmap(lambda code: expand(of_one, code, 3)))(codes.at[1].set(jnp.nan))
     assert np.all(np.isnan(batch.matrix[1])) and np.all(np.isfinite(batch.matrix[::2]))
     q, code = batch.directions[0], codes[0]
-    here, left, right = (decode(prior, x) for x in (code, code - 1e-2 * q, code + 1e-2 * q))
+    here, left, right = (
+        jax.jit(decode)(prior, x) for x in (code, code - 1e-2 * q, code + 1e-2 * q)
+    )
     J = (right - left).reshape(3, -1) / 2e-2
     p = jax.nn.sigmoid(here).ravel()
     H = (TARGET.occupied + TARGET.empty).ravel() * p * (1 - p) / p.size
     expected = (J * H) @ J.T
     np.testing.assert_allclose(batch.matrix[0], expected, atol=0.02 * np.abs(expected).max())
-    loss, slope = jax.value_and_grad(of_one)(code)
+    loss, slope = jax.jit(jax.value_and_grad(of_one))(code)
     np.testing.assert_allclose(batch.loss[0], loss, rtol=1e-5)
     np.testing.assert_allclose(batch.slope[0], slope, rtol=1e-3, atol=1e-6)
 
