@@ -21,6 +21,7 @@ LayoutName = Literal[
     "scannet",
     "replica",
     "icl-nuim",
+    "realsense",
     "npz",
     "redwood",
     "bundlesdf",
