@@ -10,8 +10,8 @@ the box put where the frames saw the object end, as `reconstruct` does after eve
 Medians over the seats: yaw error in degrees; error of the extents in per cent, all three axes and
 the largest of each seat; distance of the centre in cm. The target is 3 degrees and 2 %.
 
-Results: experiments/results/alignment.json, of 12 seats and 4 frames. Time: a minute for these, half
-an hour for all 78 seats.
+Results: experiments/results/alignment.json, of 12 seats and 4 frames, which take a minute; all 78
+seats take half an hour.
 """
 
 from dataclasses import dataclass, replace
