@@ -33,11 +33,12 @@ from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.mapping.placement import placing
 from jaxshape.mapping.placement.faces import Cutout, faces_of, fitted
-from jaxshape.mapping.placement.placing import Placement, turn
+from jaxshape.mapping.placement.placing import Placement
 from jaxshape.mapping.placement.rays import RaySamples, pooled, sample_rays
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
+from runs import spread
 
 RESULTS = Path(__file__).parent / "results"
 SHAPE, LENS = (240, 320), Intrinsics(*jnp.float32([280, 280, 160, 120]))
@@ -76,7 +77,7 @@ def main(config: Config) -> None:
 def run(config: Config) -> dict[str, Any]:
     """Align every seat with each number of frames; medians of the errors."""
     sources = meshes.list_meshes(config.meshes)
-    chosen = np.linspace(0, len(sources) - 1, min(config.seats, len(sources))).round().astype(int)
+    chosen = spread(len(sources), config.seats)
     prior = load_prior("chair-autoencoder")
     each = {str(count): [] for count in config.frames}
     for number in chosen:
@@ -147,7 +148,7 @@ def _wrong_start(extents: np.ndarray, prior: ShapePrior, rng: np.random.Generato
     yaw, factor = np.radians(TURN) * rng.choice([-1, 1]), GROW ** rng.choice([-1, 1])
     aside = rng.normal(size=3)
     T = jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3.from_matrix(turn(jnp.float32(yaw))),
+        jaxlie.SO3.from_y_radians(jnp.float32(yaw)),
         jnp.float32(ASIDE * aside / np.linalg.norm(aside)),
     )
     large = jnp.float32(1e3)  # a misfit that any other betters

@@ -32,6 +32,7 @@ from jaxshape.mapping.scene.evidence import Predicted, predict_hidden
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
+from runs import earlier
 from things import KINDS, thing
 
 RESULTS = Path(__file__).parent / "results"
@@ -63,8 +64,7 @@ def run(config: Config) -> dict[str, Any]:
     """Score all objects, going on from earlier results of the same settings."""
     path = config.results / "class_evidence.json"
     settings = {"count": config.count, "tables": config.tables is not None}
-    earlier = json.loads(path.read_text()) if path.is_file() else {}
-    done = earlier["objects"] if earlier.get("settings") == settings else {}
+    done = earlier(path, settings, "objects")
     priors = {"chair": load_prior("chair")}
     if config.tables is not None:
         priors["table"] = load_prior(config.tables)

@@ -11,7 +11,6 @@ its verdict must not be good, or it must warn of sides that were not seen.
 Results: experiments/results/first_frames.json, run by run: one that was killed goes on.
 """
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,8 @@ from jaxshape.mapping.segmentation.planes import camera_points
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.process import prepare_process
-from rebuilding import judgement, rebuilt, usual
+from rebuilding import judgement, middle_pixel, rebuilt, usual
+from runs import earlier
 
 RESULTS = Path(__file__).parent / "results"
 WAYS = ("given", "first", "none")
@@ -76,8 +76,7 @@ def run(config: Config) -> dict[str, Any]:
     path = config.results / "first_frames.json"
     firsts = config.first[: 1 if config.smoke else None]
     settings = {"recording": config.recording.name, "box": config.box.name, "first": list(firsts)}
-    earlier = json.loads(path.read_text()) if path.is_file() else {}
-    done = earlier["runs"] if earlier.get("settings") == settings else {}
+    done = earlier(path, settings, "runs")
     sequence, box = open_sequence(config.recording), read_box(config.box)
     placer, mapper = usual()
     for first in firsts:
@@ -128,9 +127,7 @@ def middle_of(frame: Frame, box: Box) -> tuple[float, float]:
     points = camera_points(frame.depth, frame.intrinsics)
     T = np.asarray(frame.T_world_camera)
     shown = points_in_box(points @ T[:3, :3].T + T[:3, 3], box)
-    row, column = np.nonzero(shown)
-    middle = np.argmin(np.hypot(row - np.median(row), column - np.median(column)))
-    return float(column[middle]) + 0.5, float(row[middle]) + 0.5
+    return middle_pixel(shown)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,8 @@ and nothing may be wrong without a warning or a verdict other than good.
 Results: experiments/results/hand_held.json, seat by seat: a run that was killed goes on.
 """
 
-import json
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,7 +35,8 @@ from jaxshape.mapping.placement.finding import find_start
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.process import prepare_process
-from rebuilding import judgement, rebuilt, usual
+from rebuilding import judgement, middle_pixel, rebuilt, usual
+from runs import earlier, spread
 
 RESULTS = Path(__file__).parent / "results"
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
@@ -79,25 +78,15 @@ def run(config: Config) -> dict[str, Any]:
     """Rebuild every seat, going on from earlier results of the same settings."""
     path = config.results / "hand_held.json"
     settings = {"seats": config.seats, "frames": config.frames, "meshes": config.meshes.name}
-    done = _earlier(path, settings)
+    done = earlier(path, settings, "seats")
     placer, mapper = usual()
-    for source in _chosen(config):
+    sources = meshes.list_meshes(config.meshes)
+    for source in (sources[i] for i in spread(len(sources), config.seats)):
         if source.name not in done:
             done[source.name] = _rebuilt(source, config.frames, mapper, placer)
             write_json(path, {"settings": settings, "summary": summary(done), "seats": done})
             print(source.name, _row(done[source.name]), flush=True)
     return {"settings": settings, "summary": summary(done), "seats": done}
-
-
-def _earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    earlier = json.loads(path.read_text()) if path.is_file() else {}
-    return earlier["seats"] if earlier.get("settings") == settings else {}
-
-
-def _chosen(config: Config) -> Iterator[meshes.MeshSource]:
-    sources = meshes.list_meshes(config.meshes)
-    count = min(config.seats, len(sources))
-    yield from (sources[i] for i in np.linspace(0, len(sources) - 1, count).round().astype(int))
 
 
 def summary(seats: dict[str, Any]) -> dict[str, int]:
@@ -173,10 +162,9 @@ def record(folder: Path, mesh: trimesh.Trimesh, frames: int, seed: int) -> Recor
     first = jaxlie.SE3.from_matrix(jnp.float32(T[:1]))
     alone, _ = render_depth(mesh, first, lens, rows)
     shown = np.isfinite(alone[0]) & (alone[0] < clean[0] + 1e-4)
-    row, column = np.nonzero(shown)
-    middle = np.argmin(np.hypot(row - np.median(row), column - np.median(column)))
-    click = float(column[middle]) + 0.5, float(row[middle]) + 0.5
-    return Recorded(folder, click, mesh.bounds.mean(axis=0), np.asarray(mesh.extents, float))
+    return Recorded(
+        folder, middle_pixel(shown), mesh.bounds.mean(axis=0), np.asarray(mesh.extents, float)
+    )
 
 
 def _in_a_room(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

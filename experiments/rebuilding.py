@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from jaxshape.data.sequences import Sequence
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.doubts import doubts_of, unseen_of
@@ -14,6 +16,13 @@ from jaxshape.results.output import only, shape_mesh
 from jaxshape.results.progress import floor_height, observation_of, seen_views
 from jaxshape.results.verdict import judged, quality_of
 from jaxshape.search.config import RefineConfig
+
+
+def middle_pixel(shown: np.ndarray) -> tuple[float, float]:
+    """The pixel, u and v, nearest to the middle of all that are true: where to click."""
+    row, column = np.nonzero(shown)
+    middle = np.argmin(np.hypot(row - np.median(row), column - np.median(column)))
+    return float(column[middle]) + 0.5, float(row[middle]) + 0.5
 
 
 def usual() -> tuple[ShapePrior, Mapper]:

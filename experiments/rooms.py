@@ -23,7 +23,7 @@ import trimesh
 import tyro
 
 from filming import film, look_from
-from jaxshape.data.boxes import Box
+from jaxshape.data.boxes import Box, in_object
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.families import FAMILIES, TEST_SEEDS
 from jaxshape.data.meshes import sample_surface
@@ -39,6 +39,7 @@ from jaxshape.report.figures import save_figure
 from jaxshape.report.palette import CYCLE
 from jaxshape.results.output import only, shape_mesh
 from jaxshape.results.progress import observation_of
+from runs import earlier
 from things import KINDS, thing
 
 RESULTS = Path(__file__).parent / "results"
@@ -81,8 +82,7 @@ def run(config: Config) -> dict[str, Any]:
     """Rebuild every room, going on from earlier results of the same settings."""
     path = config.results / "rooms.json"
     settings = {"frames": config.frames, "tables": config.tables is not None}
-    earlier = json.loads(path.read_text()) if path.is_file() else {}
-    done = earlier["rooms"] if earlier.get("settings") == settings else {}
+    done = earlier(path, settings, "rooms")
     classes = classes_of(config.tables)
     for number in range(config.rooms):
         if str(number) not in done:
@@ -240,7 +240,7 @@ def box_overlap(a: Box, b: Box) -> float:
 
     def share(one: Box, other: Box) -> float:
         world = unit * one.size @ one.T_world_object[:3, :3].T + one.T_world_object[:3, 3]
-        p = (world - other.T_world_object[:3, 3]) @ other.T_world_object[:3, :3]
+        p = in_object(world, other)
         return float((np.abs(p) < other.size / 2).all(axis=1).mean())
 
     both = (share(a, b) * np.prod(a.size) + share(b, a) * np.prod(b.size)) / 2

@@ -17,7 +17,6 @@ Results: experiments/results/tracked_orbits.json and .png; a seat that is done i
 Time: 15 minutes on two cores.
 """
 
-import json
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -49,6 +48,7 @@ from jaxshape.process import prepare_process
 from jaxshape.report.palette import BLUE, FOG, INK, ORANGE, SKY
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
+from runs import earlier, spread
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -100,8 +100,10 @@ def run(config: Config) -> dict[str, Any]:
     path = config.results / "tracked_orbits.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("results", "workers")}
     settings["meshes"] = config.meshes.name
-    done = _earlier(path, settings)
-    missing = {name: one for name, one in _choose(config).items() if name not in done}
+    done = earlier(path, settings, "seats")
+    sources = meshes.list_meshes(config.meshes)
+    chosen = [sources[i] for i in spread(len(sources), config.seats)]
+    missing = {one.name: one for one in chosen if one.name not in done}
     with ProcessPoolExecutor(config.workers, get_context("spawn"), prepare_process) as pool:
         futures = {pool.submit(_run_seat, one, config): name for name, one in missing.items()}
         for number, future in enumerate(as_completed(futures), start=1):
@@ -110,20 +112,6 @@ def run(config: Config) -> dict[str, Any]:
             metrics = {"settings": settings, "summary": summarize(done), "seats": done}
             write_json(path, metrics)
     return {"settings": settings, "summary": summarize(done), "seats": done}
-
-
-def _earlier(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    earlier = json.loads(path.read_text())
-    return earlier["seats"] if earlier["settings"] == settings else {}
-
-
-def _choose(config: Config) -> dict[str, meshes.MeshSource]:
-    """Seats from all over the collection, by name."""
-    sources = meshes.list_meshes(config.meshes)
-    chosen = np.linspace(0, len(sources) - 1, config.seats).round().astype(int)
-    return {sources[i].name: sources[i] for i in chosen}
 
 
 # One seat ------------------------------------------------------------------------------------

@@ -34,12 +34,22 @@ def points_in_box(points: Float[np.ndarray, "*batch 3"], box: Box) -> Bool[np.nd
         points: Points in the world `[*batch 3]`, in metres.
         box: The box.
     """
-    R, t = box.T_world_object[:3, :3], box.T_world_object[:3, 3]
-    p = (points - t) @ R  # the inverse of a rotation is its transpose, applied to rows
+    p = in_object(points, box)
     inside = _within(p, -box.size / 2, box.size / 2)
     for low, high in box.exclude:
         inside = inside & ~_within(p, low, high)
     return inside
+
+
+def in_object(points: Float[np.ndarray, "*batch 3"], box: Box) -> Float[np.ndarray, "*batch 3"]:
+    """Points of the world in the object frame of a box.
+
+    Args:
+        points: Points in the world `[*batch 3]`, in metres.
+        box: The box.
+    """
+    R, t = box.T_world_object[:3, :3], box.T_world_object[:3, 3]
+    return (points - t) @ R  # the inverse of a rotation is its transpose, applied to rows
 
 
 def _within(

@@ -10,11 +10,10 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxshape.data.boxes import Box
+from jaxshape.data.boxes import Box, in_object
 from jaxshape.mapping.placement.faces import (
     Cutout,
     cutouts,
-    in_object,
     object_points,
     reach_of,
     world_points,

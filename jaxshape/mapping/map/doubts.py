@@ -5,14 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxshape.data.boxes import Box
+from jaxshape.data.boxes import Box, in_object
 from jaxshape.mapping.map.recording import Progress
 from jaxshape.mapping.placement.faces import (
     FACES,
     Cutout,
     cutouts,
     faces_of,
-    in_object,
     object_points,
 )
 from jaxshape.mapping.placement.finding import Start

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxshape.data.boxes import Box
+from jaxshape.data.boxes import Box, in_object
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.mapping.placement.placing import PlacementConfig
 from jaxshape.mapping.tracking.keyframes import Keyframe
@@ -136,7 +136,7 @@ def fits(box: Box, faces: Faces | None) -> bool:
         faces: The ends of the object along its axes; None where nothing was measured.
     """
     fitting = fitted(box, faces)
-    moved = (fitting.T_world_object[:3, 3] - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
+    moved = in_object(fitting.T_world_object[:3, 3], box)
     return bool((np.abs(moved) + np.abs(fitting.size - box.size) / 2 < FIT).all())
 
 
@@ -220,16 +220,6 @@ def world_points(view: Cutout) -> Float[np.ndarray, "h w 3"]:
     points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
     T = view.T_world_camera
     return points @ T[:3, :3].T + T[:3, 3]
-
-
-def in_object(points: Float[np.ndarray, "n 3"], box: Box) -> Float[np.ndarray, "n 3"]:
-    """Points of the world in the object frame of a box.
-
-    Args:
-        points: Points in the world `[n 3]`, in metres.
-        box: The box.
-    """
-    return (points - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
 
 
 def _passed_outside(

@@ -304,14 +304,14 @@ def place(
     def judged(boxes, codes, decoder):
         logits = decode_prepared(prior.model, decoder, codes)
         hypothesis = Hypothesis(boxes, jax.vmap(space.from_code)(codes))
-        total = finite_or_inf(fits(logits, boxes) + unlikely(hypothesis.point))
+        total = finite_or_inf(fits(logits, boxes) + _code_penalty(hypothesis.point))
         return _Candidate(hypothesis, decoder.own, logits, total)
 
     def fitted(candidates):
         held = lambda boxes: fits(candidates.logits, boxes)  # noqa: E731
         boxes, fit = descend(candidates.hypothesis.box, held, _longer(unit), FIT_STEPS, rise=3)
         hypothesis = candidates.hypothesis._replace(box=boxes)
-        total = fit + unlikely(hypothesis.point)
+        total = fit + _code_penalty(hypothesis.point)
         return candidates._replace(hypothesis=hypothesis, misfit=total)
 
     boxes = propose(seen, floor, config)
@@ -328,7 +328,7 @@ def place(
 
     def misfits(hypothesis):
         logits = decode_prepared(prior.model, shared, jax.vmap(space.to_code)(hypothesis.point))
-        return fits(logits, hypothesis.box) + unlikely(hypothesis.point)
+        return fits(logits, hypothesis.box) + _code_penalty(hypothesis.point)
 
     steps = jnp.where(jnp.isnan(known.misfit), config.steps, config.steps_again)
     whole = Hypothesis(unit, jnp.float32(0.1))
@@ -352,7 +352,7 @@ class _Candidate(NamedTuple):
     misfit: Float[Array, "*batch"]
 
 
-def unlikely(point: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
+def _code_penalty(point: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
     """The part of the misfit that a code has by itself, given as a point of the whitened space."""
     return CODE_WEIGHT * 0.5 * jnp.sum(point**2, axis=-1)
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from jaxshape.data.boxes import Box, points_in_box
+from jaxshape.data.boxes import Box, in_object, points_in_box
 from jaxshape.mapping.segmentation.parts import SPECK
 from jaxshape.mapping.segmentation.specks import confirmed
 
@@ -86,14 +86,14 @@ class _Known(NamedTuple):
 
     Attributes:
         ours: Points of the object.
+        columns: The same in the frame of its box, low in height, so that what is above and below
+            them is near.
         others: Points of other things.
-        columns: Points of the object in the frame of its box, low in height, so that what is above
-            and below them is near.
     """
 
     ours: KDTree
-    others: KDTree
     columns: KDTree
+    others: KDTree
 
 
 def belonging(
@@ -114,13 +114,13 @@ def belonging(
     parts = [part for i, seen in enumerate(frames) for part in _parts(i, seen, box, reach, column)]
     sure = [seen.points[seen.sure & points_in_box(seen.points, reach)] for seen in frames]
     background = [_background(seen, column) for seen in frames]
-    known = _Known(_tree(sure), _tree(background), _columns(sure, box))
+    known = _Known(*_trees(sure, box), _tree(background))
     whole, clouds = set(), sure
     for _ in range(ROUNDS):
         ours = [part for part in parts if _is_ours(part, known, box)]
         if beside := _together(parts, ours, whole, frames):
             more = [*clouds, *(part.points for part in beside)]
-            known = known._replace(ours=_tree(more), columns=_columns(more, box))
+            known = _Known(*_trees(more, box), known.others)
             ours = [part for part in parts if _is_ours(part, known, box)]
         taken = {part[:2] for part in ours}
         apart = [part for part in parts if part[:2] not in taken and _is_apart(part)]
@@ -129,7 +129,7 @@ def belonging(
         if whole == before:
             break
         clouds = [*sure, *(part.points for part in ours if part[:2] in whole)]
-        known = known._replace(ours=_tree(clouds), columns=_columns(clouds, box))
+        known = _Known(*_trees(clouds, box), known.others)
     found = [
         _pixels(seen, [p for p in ours if p.frame == i], whole, known, box, reach)
         for i, seen in enumerate(frames)
@@ -154,14 +154,14 @@ def _adjoins(part: _Part, columns: KDTree, box: Box) -> bool:
     return float(np.isfinite(away).mean()) > AGAIN
 
 
-def _columns(clouds: list[Float[np.ndarray, "_ 3"]], box: Box) -> KDTree:
-    return _tree([_flat(points, box) for points in clouds])
+def _trees(clouds: list[Float[np.ndarray, "_ 3"]], box: Box) -> tuple[KDTree, KDTree]:
+    """Points of the object, and their columns."""
+    return _tree(clouds), _tree([_flat(points, box) for points in clouds])
 
 
 def _flat(points: Float[np.ndarray, "n 3"], box: Box) -> Float[np.ndarray, "n 3"]:
     """Points in the frame of the box, its height scaled so that `ALONG` is as far as `BESIDE`."""
-    own = (points - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
-    return own * (1.0, BESIDE / ALONG, 1.0)
+    return in_object(points, box) * (1.0, BESIDE / ALONG, 1.0)
 
 
 def _together(

@@ -220,8 +220,8 @@ def along_walls(planes: list[Plane]) -> Float[np.ndarray, " 3"] | None:
     """The vertical of a room whose floor is not seen: the direction that lies in two of its walls.
 
     Any two large planes that meet at about a right angle count as walls where the line along which
-    they meet is roughly upright in the image of a camera in hand. Of several pairs, the one that
-    holds most points.
+    they meet is roughly upright in the image of a camera in hand. Of several pairs, the one whose
+    smaller wall holds most points.
 
     Args:
         planes: Planes of the view, as `dominant_planes` finds them.
