@@ -36,9 +36,10 @@ class Recording(NamedTuple):
     """In the object frame."""
 
 
-def record(occluder: bool = False, noise: SensorNoise = SensorNoise()) -> Recording:
-    """Walk around the chair; with `occluder`, a box passes before it in frames 4 to 9."""
-    chair = random_chair(2, style="side chair")
+def record(occluder: bool = False, noise: SensorNoise = SensorNoise(), seed: int = 2) -> Recording:
+    """Walk around the side chair of a seed; with `occluder`, a box passes before it in frames 4 to
+    9."""
+    chair = random_chair(seed, style="side chair")
     T_object_camera = _poses()
     T = np.asarray(T_object_camera.as_matrix(), np.float64)
     depth, cosine = render_depth(chair, T_object_camera, INTRINSICS, SIZE)

@@ -15,6 +15,7 @@ from jaxshape.report.palette import COLORS
 AZIMUTH, ELEVATION = 35.0, 25.0
 
 _SUPERSAMPLING = 2  # pixels averaged along each axis, to smooth edges
+_ROWS = 64  # rows of rays that are cast together
 _MARGIN = 1.02  # room around the object, as a factor of its extent
 _LIGHT = np.array([-0.35, 0.8, 0.5]) / np.linalg.norm([-0.35, 0.8, 0.5])  # right, up, towards us
 _AMBIENT = 0.68
@@ -191,21 +192,34 @@ def render_mesh(
     Fast where `embreex` is installed.
     """
     pixels = size * _SUPERSAMPLING
-    canvas = np.ones((pixels * pixels, 3))
+    canvas = np.ones((pixels, pixels, 3))
     if len(mesh.faces) == 0:
-        return _to_image(canvas.reshape(pixels, pixels, 3))
+        return _to_image(canvas)
     view = _view(azimuth, elevation)
     vertices = mesh.vertices @ view.T  # right, up, towards the viewer
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = _MARGIN * (high - low)[:2].max() / pixels
     across = (np.arange(pixels) + 0.5 - pixels / 2) * step
-    y, x = np.meshgrid(-across, across, indexing="ij")
     center = (low + high) / 2
-    origins = np.stack([center[0] + x, center[1] + y, np.full_like(x, high[2] + step)], axis=-1)
-    directions = np.broadcast_to(-view[2], (pixels * pixels, 3))
-    hits, rays, faces = mesh.ray.intersects_location(
-        origins.reshape(-1, 3) @ view, directions, multiple_hits=False
-    )
+    for first in range(0, pixels, _ROWS):  # rays of the whole picture take hundreds of megabytes
+        rows = slice(first, first + _ROWS)
+        y, x = np.meshgrid(-across[rows], across, indexing="ij")
+        away = np.full_like(x, high[2] + step)
+        origins = np.stack([center[0] + x, center[1] + y, away], axis=-1)
+        seen, shades = _seen(mesh, origins.reshape(-1, 3) @ view, view, color)
+        canvas[rows].reshape(-1, 3)[seen] = shades
+    return _to_image(canvas)
+
+
+def _seen(
+    mesh: trimesh.Trimesh,
+    origins: Float[np.ndarray, "n 3"],
+    view: Float[np.ndarray, "3 3"],
+    color: str | UInt8[np.ndarray, "v 3"],
+) -> tuple[Integer[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
+    """Rays away from the viewer that meet the mesh, and the shaded colour that each sees."""
+    directions = np.broadcast_to(-view[2], origins.shape)
+    hits, rays, faces = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
     corners = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], hits)
     normals = np.einsum("nk,nkd->nd", corners, mesh.vertex_normals[mesh.faces[faces]]) @ view.T
     normals *= np.where(normals[:, 2:] < 0, -1, 1)  # open surfaces are seen from either side
@@ -213,5 +227,4 @@ def render_mesh(
     paint = rgb(color) if isinstance(color, str) else np.einsum(
         "nk,nkd->nd", corners, color[mesh.faces[faces]] / 255
     )  # fmt: skip
-    canvas[rays] = paint * _brightness(normals)[:, None]
-    return _to_image(canvas.reshape(pixels, pixels, 3))
+    return rays, paint * _brightness(normals)[:, None]
