@@ -75,7 +75,7 @@ class BuildScene:
         from jaxshape.mapping.scene.following import finish_scene, follow_scene
         from jaxshape.model.weights import load_scene_priors
         from jaxshape.report.page import write_report
-        from jaxshape.results.scene_files import write_scene
+        from jaxshape.results.scene_files import write_scene, write_scene_progress
 
         priors, placers = load_scene_priors(self.prior)
         classes = build_classes(
@@ -115,6 +115,8 @@ class BuildScene:
             ):
                 note = f"{len(scene.objects)} objects"
                 bar.update(task, completed=len(scene.logs), note=note)
+                if scene.logs[-1].status == "keyframe":
+                    write_scene_progress(self.output, sequence, scene, figures)
         assert scene is not None  # there is at least the first frame
         with console.status("deciding what the objects are"):
             scene = finish_scene(scene, classes)
@@ -151,16 +153,11 @@ class BuildScene:
 
     def _conclude(self, result: dict[str, Any]) -> None:
         """Print a summary: a line for each object."""
+        from jaxshape.results.summary import objects_in_words
+
         print(f"{result['frames']} frames, {result['keyframes']} of them keyframes")
-        for one in result["objects"]:
-            size = " x ".join(f"{extent:.2f}" for extent in one["size"])
-            what = one["class"] or "none of the classes"
-            reasons = "; ".join(one["verdict_reasons"])
-            because = f" because {reasons}" if reasons else ""
-            print(
-                f"{one['name']}: {what} ({one['sure']:.0%} sure), {size} m, "
-                f"{one['verdict']}{because}"
-            )
+        for line in objects_in_words(result):
+            print(line)
         for warning in result["warnings"]:
             warn(warning)
         print(f"wrote scene.glb, scene.json, objects.png, report.html and more to {self.output}")

@@ -11,14 +11,14 @@ from jaxshape.cli.common import require
 
 @dataclass(frozen=True)
 class ViewResult:
-    """Show a result folder in the browser: the shape, grids and cameras, to turn and to switch on
-    and off. While `jaxshape reconstruct` writes the folder, the picture follows.
+    """Show a result folder in the browser: the shape, grids and cameras, or the objects of a scene,
+    to turn and to switch on and off. While the folder is being written, the picture follows.
 
     Example: jaxshape view out/demo
     """
 
     result: Positional[Path]
-    """Folder made by `jaxshape reconstruct` or `jaxshape demo`, finished or not."""
+    """Folder made by `jaxshape reconstruct`, `scene` or `demo`, finished or not."""
     port: int = 8080
     """Port to serve at, 1 to 65535; the next free one if it is taken."""
     host: str = "127.0.0.1"

@@ -47,5 +47,6 @@ LAYERS = {
     "truth": Layer("truth", COLORS["truth"], False),
     "cameras": Layer("keyframes", INK, True),
     "trajectory": Layer("trajectory", COLORS["measured"], True),
+    "objects": Layer("objects", GREEN, True),
 }
 """Everything of a result that can be shown in 3D."""

@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Any, NamedTuple
 
 from jaxshape.report.palette import GREY, STATUS_COLORS
-from jaxshape.results.folder import KeyframeRecord, ResultFolder
+from jaxshape.results.folder import KeyframeRecord, ResultFolder, entries_of_objects
 from jaxshape.results.summary import number
 
 
@@ -64,10 +64,9 @@ def keyframe_table(keyframes: Sequence[KeyframeRecord]) -> str:
 
 def objects(found: ResultFolder) -> str:
     """The objects of a scene, and what became of them while it was filmed."""
-    entries = found.result.get("objects")
-    if not isinstance(entries, list):
+    if "objects" not in found.result:
         return ""
-    rows = [_object_row(one) for one in entries if isinstance(one, dict)]
+    rows = map(_object_row, entries_of_objects(found.result))
     heading = ("object", "class", "sure", "width × height × depth", "verdict")
     events = "".join(f"<li>{escape(str(event))}</li>" for event in found.result.get("events") or ())
     about = (

@@ -24,16 +24,18 @@ from jaxshape.report.paint import Paint, paints
 from jaxshape.report.palette import LAYERS
 from jaxshape.results.folder import (
     KeyframeRecord,
+    ObjectBox,
     ResultFolder,
     camera_poses,
     extent,
     half_field_of_view,
     mesh_in_object,
+    object_boxes,
     picture,
     read_folder,
     thumbnail,
 )
-from jaxshape.results.summary import headline, tracked, warnings_of
+from jaxshape.results.summary import headline, objects_in_words, tracked, warnings_of
 
 WATCHED = ("mesh.ply", "grid.npz", "keyframes.json", "result.json", "scene.json")
 PLAIN = "one colour"
@@ -101,6 +103,7 @@ class LiveView:
     def _tell(self) -> None:
         figures = headline(self.found)
         lines = [f"<b>{escape(name)}</b>: {escape(value)}" for name, value, _ in figures]
+        lines += map(escape, objects_in_words(self.found.result))
         lines += [f"⚠ {escape(text)}" for text in warnings_of(self.found)]
         state = "still running" if self.found.result.get("running") else ""
         name = escape(str(self.found.result.get("object", self.found.name)))
@@ -233,6 +236,9 @@ def _nodes(
         nodes[name] = content, partial(_camera, scene, name, found, keyframe, T)
     if len(path):
         nodes["/trajectory"] = path.tobytes(), partial(_path, scene, path)
+    for number, one in enumerate(object_boxes(found)):
+        name, content = f"/objects/{number}", one.T.tobytes() + one.size.tobytes()
+        nodes[name] = content + one.name.encode(), partial(_box, scene, name, one)
     return nodes
 
 
@@ -250,6 +256,16 @@ def _mesh(scene: viser.SceneApi, mesh: trimesh.Trimesh, paint: Paint | None) -> 
 
 def _path(scene: viser.SceneApi, path: Float[np.ndarray, "s 2 3"]) -> Any:
     return scene.add_line_segments("/trajectory", path, _rgb("trajectory"), **LINES)
+
+
+def _box(scene: viser.SceneApi, name: str, one: ObjectBox) -> Any:
+    """The edges of an object's box, with its name above."""
+    corners = one.size * (trimesh.bounds.corners([[-0.5] * 3, [0.5] * 3]))
+    pairs = [(a, b) for a in range(8) for b in range(a) if (corners[a] != corners[b]).sum() == 1]
+    frame = scene.add_frame(name, show_axes=False, wxyz=_wxyz(one.T), position=one.T[:3, 3])
+    scene.add_line_segments(f"{name}/box", corners[np.array(pairs)], _rgb("objects"), **LINES)
+    scene.add_label(f"{name}/label", one.name, position=(0.0, 0.55 * one.size[1], 0.0))
+    return frame
 
 
 def _cubes(

@@ -77,11 +77,25 @@ class ResultFolder(NamedTuple):
     problems: list[str]
 
 
+class ObjectBox(NamedTuple):
+    """The box of an object of a scene.
+
+    Attributes:
+        name: Name of the object.
+        T: From the frame of the box, whose origin is its centre, to that of the folder `[4 4]`.
+        size: Extents of the box along its axes, in metres.
+    """
+
+    name: str
+    T: Float[np.ndarray, "4 4"]
+    size: Float[np.ndarray, " 3"]
+
+
 def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
     """Read a folder made by `demo` or `reconstruct`, finished or not, as far as it is there.
 
-    Without a grid the object frame is not known; the frame of the first keyframe, turned upright,
-    takes its place.
+    Without a grid the object frame is not known; that of a scene's first object takes its place, or
+    else the frame of the first keyframe, turned upright.
 
     Args:
         folder: The result folder.
@@ -105,13 +119,14 @@ def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
 
     keyframes, frames, intrinsics, shape = read("keyframes.json", _keyframes, ([], [], None, None))
     grids, frame = read("grid.npz", _grids, ({}, None))
-    origin, voxel_size, T_world_object = frame or _stand_in(keyframes)
+    result = read("result.json", reading.read_json_object, None)
+    result = result or read("scene.json", reading.read_json_object, {})
+    origin, voxel_size, T_world_object = frame or _stand_in(keyframes, result)
     T_object_world = np.linalg.inv(T_world_object)
     mesh, measured, color, confidence = read("mesh.ply", read_ply, (None,) * 4)
     return ResultFolder(
         name=folder.resolve().name,
-        result=read("result.json", reading.read_json_object, None)
-        or read("scene.json", reading.read_json_object, {}),
+        result=result,
         mesh=mesh,
         measured=measured,
         confidence=confidence,
@@ -138,6 +153,27 @@ def camera_poses(found: ResultFolder) -> list[tuple[KeyframeRecord, Float[np.nda
     """The keyframes whose pose is known, each with its `T_object_camera`."""
     poses = ((k, k.T_world_camera) for k in found.keyframes)
     return [(k, found.T_object_world @ pose) for k, pose in poses if pose is not None]
+
+
+def object_boxes(found: ResultFolder) -> list[ObjectBox]:
+    """The boxes of the objects of a scene; those that cannot be read are left out."""
+    boxes = []
+    for entry in entries_of_objects(found.result):
+        T_world_object = pose_of(entry.get("T_world_object"))
+        try:
+            size = _positive(entry.get("size"), 3)
+        except ValueError:
+            continue
+        if T_world_object is not None:
+            T = found.T_object_world @ T_world_object
+            boxes.append(ObjectBox(str(entry.get("name")), T, np.array(size)))
+    return boxes
+
+
+def entries_of_objects(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """The entries of the objects of a scene; none in a result of one object."""
+    entries = result.get("objects")
+    return [one for one in entries if isinstance(one, dict)] if isinstance(entries, list) else []
 
 
 def extent(found: ResultFolder) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -237,10 +273,15 @@ def pose_of(value: Any) -> Float[np.ndarray, "4 4"] | None:
     return pose if is_pose and abs(np.linalg.det(pose)) > 1e-12 else None
 
 
-def _stand_in(keyframes: list[KeyframeRecord]) -> tuple[Any, ...]:
-    """A frame to look from before the object's is known: cameras see y pointing down."""
-    first = next((k.T_world_camera for k in keyframes if k.T_world_camera is not None), None)
-    upright = np.eye(4) if first is None else first @ np.diag([1.0, -1.0, -1.0, 1.0])
+def _stand_in(keyframes: list[KeyframeRecord], result: dict[str, Any]) -> tuple[Any, ...]:
+    """A frame to look from where there is no grid: that of a scene's first object, which stands
+    upright, or of the first camera, in which y points down."""
+    objects = (pose_of(one.get("T_world_object")) for one in entries_of_objects(result))
+    cameras = (k.T_world_camera for k in keyframes)
+    upright = next((T for T in objects if T is not None), None)
+    if upright is None:
+        first = next((T for T in cameras if T is not None), None)
+        upright = np.eye(4) if first is None else first @ np.diag([1.0, -1.0, -1.0, 1.0])
     return np.zeros(3), np.ones(3), upright
 
 

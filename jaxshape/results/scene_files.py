@@ -19,11 +19,13 @@ import trimesh
 
 from jaxshape.data.sequences import Sequence
 from jaxshape.files import write_json
+from jaxshape.geometry.grids import binary
 from jaxshape.mapping.map.doubts import unreadable, unseen_in_words, unseen_of
 from jaxshape.mapping.map.recording import Progress
+from jaxshape.mapping.map.state import grids_of
 from jaxshape.mapping.scene.following import Scene, SceneObject
 from jaxshape.results.glb import Node, write_glb
-from jaxshape.results.output import ShapeMesh, write_shape_mesh
+from jaxshape.results.output import SMOOTHING, ShapeMesh, write_shape_mesh
 from jaxshape.results.progress import (
     color_views,
     counts,
@@ -34,7 +36,7 @@ from jaxshape.results.progress import (
     write_pictures,
     write_trajectories,
 )
-from jaxshape.results.surface import write_mesh
+from jaxshape.results.surface import surface, write_mesh
 
 
 class WrittenObject(NamedTuple):
@@ -82,6 +84,45 @@ def write_scene(
     result = scene_entries(scene, written, figures, empty)
     write_json(folder / "scene.json", result)
     return result
+
+
+def write_scene_progress(
+    folder: Path, sequence: Sequence, scene: Scene, figures: dict[str, Any]
+) -> None:
+    """Write what is known of a scene that is still followed, so that `jaxshape view` can watch.
+
+    `mesh.ply` is the surface of the measured voxels of all objects, whose classes are not known
+    yet; what an earlier run left of finished objects is removed.
+
+    Args:
+        folder: The result folder.
+        sequence: The recording.
+        scene: The scene, from `follow_scene`.
+        figures: Further entries of `scene.json`.
+    """
+    shutil.rmtree(folder / "objects", ignore_errors=True)
+    whole = whole_progress(scene)
+    write_pictures(folder / "keyframes", sequence, whole)
+    write_json(folder / "keyframes.json", keyframe_entries(sequence, whole))
+    meshes = list(filter(None, map(_measured_mesh, scene.objects)))
+    if meshes:
+        write_mesh(trimesh.util.concatenate(meshes), folder / "mesh.ply")
+    entries = [
+        _place_of(one) | {"class": None, "size": one.progress.start.box.size.tolist()}
+        for one in scene.objects
+    ]
+    result = figures | counts(scene.camera) | {"running": True, "objects": entries}
+    write_json(folder / "scene.json", result | {"events": list(scene.told.events)})
+
+
+def _measured_mesh(one: SceneObject) -> trimesh.Trimesh | None:
+    """The surface of an object's measured voxels, in the world; None where there are none."""
+    state = one.progress.state
+    occupied = np.asarray(binary(grids_of(state)).occupied)
+    if not occupied.any():
+        return None
+    T_world_object = state.place.box.T_world_object
+    return surface(occupied, state.place.frame, smoothing=SMOOTHING, T_world_object=T_world_object)
 
 
 def _write_object(folder: Path, sequence: Sequence, one: SceneObject) -> WrittenObject:
@@ -218,17 +259,22 @@ def scene_warnings(scene: Scene) -> list[str]:
 
 def _entry(written: WrittenObject) -> dict[str, Any]:
     one, result, found = written
-    box = one.progress.start.box
     return {
-        "name": one.name,
-        "number": one.thing.number,
+        **_place_of(one),
         "class": result["class"],
         "sure": result["sure"],
         "evidence": result["evidence"],
-        "T_world_object": box.T_world_object.tolist(),
         "size": [round(float(x), 4) for x in found.mesh.extents],
-        "is_on_top": one.thing.is_on_top,
         "verdict": result.get("verdict"),
         "verdict_reasons": result.get("verdict_reasons", []),
         "folder": f"objects/{one.name}",
+    }
+
+
+def _place_of(one: SceneObject) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "number": one.thing.number,
+        "T_world_object": one.progress.start.box.T_world_object.tolist(),
+        "is_on_top": one.thing.is_on_top,
     }

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from jaxshape.results.folder import KeyframeRecord, ResultFolder
+from jaxshape.results.folder import KeyframeRecord, ResultFolder, entries_of_objects
 
 
 class Figure(NamedTuple):
@@ -66,6 +66,21 @@ def verdict_in_words(result: dict[str, Any]) -> str:
     reasons = "; ".join(map(str, result.get("verdict_reasons") or ()))
     because = f" because {reasons}" if reasons else ""
     return f"verdict: {result['verdict']}{because}. The object is {_size(result)}."
+
+
+def objects_in_words(result: dict[str, Any]) -> Iterator[str]:
+    """A line for each object of a scene: its class, how sure that is, its size, its verdict."""
+    for one in entries_of_objects(result):
+        if "sure" in one:
+            kind = str(one.get("class") or "none of the classes")
+            what = f"{kind} ({number(one['sure'], times=100.0)}% sure)"
+        else:
+            what = "not decided yet"
+        size = " x ".join(number(side, 2) for side in one.get("size") or ())
+        reasons = "; ".join(map(str, one.get("verdict_reasons") or ()))
+        because = f" because {reasons}" if reasons else ""
+        verdict = f", {one['verdict']}{because}" if one.get("verdict") else ""
+        yield f"{one.get('name')}: {what}, {size} m{verdict}"
 
 
 def _judgement(result: dict[str, Any]) -> Iterator[Figure]:

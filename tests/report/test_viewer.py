@@ -165,6 +165,29 @@ def test_the_last_picture_stays_when_the_folder_goes(folder, open_view):
     assert not live.refresh() and nodes(live) == before
 
 
+def test_the_objects_of_a_room_stand_in_their_boxes(tmp_path, open_view):
+    T = np.eye(4)
+    T[:3, 3] = 1, 2, 3
+    box = {"T_world_object": T.tolist(), "size": [0.5, 0.9, 0.6]}
+    damaged = {"name": "object-3", "T_world_object": "here", "size": [1, 1, 1]}
+    entries = [{"name": "chair-1", "class": "chair", "sure": 0.9, **box}, damaged, "no object"]
+    content = {"objects": entries}
+    (tmp_path / "scene.json").write_text(json.dumps(content | {"running": True}))
+    live = open_view(tmp_path)
+    assert nodes(live) == {"/objects/0"}
+    assert "still running" in live.figures.content
+    assert "chair-1: chair (90% sure), 0.50 x 0.90 x 0.60 m" in live.figures.content
+    before = live._drawn["/objects/0"][1]
+    assert np.allclose(before.position, 0)  # the first object is what everything is turned by
+    entries.append({"name": "object-2", **box, "size": [0.3, 0.3, 0.3]})
+    (tmp_path / "scene.json").write_text(json.dumps(content))
+    assert live.refresh() and nodes(live) == {"/objects/0", "/objects/1"}
+    assert live._drawn["/objects/0"][1] is before
+    live.boxes["objects"].value = False
+    live._show()
+    assert not before.visible
+
+
 def test_text_from_the_folder_stays_text(folder, open_view):
     change_json(folder / "result.json", object="<b>x</b>", warnings=["<i>y</i>"])
     shown = open_view(folder).figures.content

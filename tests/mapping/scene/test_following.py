@@ -18,6 +18,9 @@ from jaxshape.mapping.placement.placing import PlacementConfig
 from jaxshape.mapping.scene.classes import build_classes
 from jaxshape.mapping.scene.following import finish_scene, follow_scene
 from jaxshape.mapping.segmentation.segment import Prompt
+from jaxshape.results.folder import object_boxes, read_folder
+from jaxshape.results.scene_files import write_scene, write_scene_progress
+from jaxshape.results.summary import objects_in_words
 from jaxshape.search.config import RefineConfig
 
 MAPPING = MappingConfig(fusion="points", min_hits=1)
@@ -66,9 +69,15 @@ def sequence(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def scene(sequence, classes):
+def followed(sequence, classes):
+    """The room after its last frame, before it is decided what its objects are."""
     *_, last = follow_scene(sequence, classes, use_poses=True)
-    return finish_scene(last, classes)
+    return last
+
+
+@pytest.fixture(scope="module")
+def scene(followed, classes):
+    return finish_scene(followed, classes)
 
 
 def test_each_object_is_of_its_class_and_the_crate_of_none(scene):
@@ -91,6 +100,34 @@ def test_nothing_is_added_to_the_crate(scene):
     (crate,) = [one for one in scene.objects if one.name.startswith("object")]
     shape = crate.progress.shape
     assert not shape.completed.any() and shape.composed.any()
+
+
+def test_a_room_can_be_watched_while_it_is_followed(followed, sequence, tmp_path):
+    write_scene_progress(tmp_path, sequence, followed, {"object": "a room"})
+    found = read_folder(tmp_path)
+    assert found.result["running"] and not found.problems
+    assert [one.name for one in object_boxes(found)] == ["object-1", "object-2", "object-3"]
+    assert np.isclose(found.T_object_world[1], [0, 1, 0, -0.4], atol=0.2).all()  # it stands upright
+    (x, _, z), (X, Y, Z) = found.mesh.bounds
+    for group in (CHAIR, TABLE, CRATE):  # something of each is in the mesh
+        middle = mesh_of(group)[1]
+        assert x - 0.1 < middle[0] < X + 0.1 and z - 0.1 < middle[2] < Z + 0.1 and Y < 1.3
+    assert all("not decided yet" in line for line in objects_in_words(found.result))
+
+
+def test_a_finished_room_is_written_with_its_classes(scene, sequence, tmp_path):
+    write_scene_progress(tmp_path, sequence, scene, {})
+    write_scene(tmp_path, sequence, scene, {"object": "a room"})
+    found = read_folder(tmp_path)
+    assert "running" not in found.result and not found.problems
+    kinds = {one["name"]: one["class"] for one in found.result["objects"]}
+    assert sorted(map(str, kinds.values())) == ["None", "chair", "table"]
+    assert {path.name for path in (tmp_path / "objects").iterdir()} == set(kinds)
+    (chair,) = [one for one in object_boxes(found) if one.name.startswith("chair")]
+    own = trimesh.load(tmp_path / "objects" / chair.name / "mesh.glb", force="mesh")
+    assert (np.abs(own.vertices) <= chair.size / 2 + 0.02).all()
+    lines = list(objects_in_words(found.result))
+    assert any(line.startswith(f"{chair.name}: chair (") and " m, " in line for line in lines)
 
 
 def test_an_object_that_is_moved_is_left_out(tmp_path, classes):
