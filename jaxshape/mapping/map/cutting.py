@@ -112,4 +112,6 @@ def _seen(view: Cutout, parts: Parts | None) -> Seen:
     segmented = np.asarray(view.segmented)
     if parts is None:
         return Seen(world_points(view), np.zeros(segmented.shape, int), segmented)
-    return Seen(world_points(view), parts.labels, parts.sure, parts.corners, parts.pairs)
+    return Seen(
+        world_points(view), parts.labels, parts.sure, parts.corners, parts.tops, parts.pairs
+    )

@@ -5,14 +5,16 @@ what is known of the object, or if it shows again what is known to be the object
 prior's reach: so that a box which was cut too short does not exclude what it should have held, and
 one that reaches too far does not hold the table beside. So does a part that two frames show
 together with the object: the seat below a back that was all that the first frame showed. Parts that
-other frames show apart from the object, or that go on beyond its reach, are something else.
+other frames show apart from the object, or that go on beyond its reach, are something else. What
+stands under a table top may be the leg of the table, and what is at the border of the image may be
+the corner of something nearer: such parts are the object only where other frames show it there.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from jaxshape.data.boxes import Box, in_object, points_in_box
 from jaxshape.mapping.segmentation.parts import SPECK
@@ -29,6 +31,10 @@ AGAIN = 0.1
 
 BESIDE, ALONG = 0.06, 1.0
 """Metres, sideways and along the vertical, within which a part adjoins the object."""
+
+EDGE, UNDER = 0.03, 0.95
+"""Metres by which a table top reaches further than was measured of it, and the share of a part that
+is below it to stand under it."""
 
 FOREIGN = 0.2
 """Share of a part above which measurements of other things cut it."""
@@ -49,6 +55,7 @@ class Seen(NamedTuple):
             too small to be a part `[h w]`.
         sure: True on pixels that are known to show the object `[h w]`.
         corners: Labels of the parts that may be corners of something nearer `[n]`.
+        tops: Number of the table top of each pixel, from 1; 0 elsewhere `[h w]`; None for none.
         pairs: Pairs of labels of parts that belong together in this frame `[m 2]`.
     """
 
@@ -56,6 +63,7 @@ class Seen(NamedTuple):
     labels: Int[np.ndarray, "h w"]
     sure: Bool[np.ndarray, "h w"]
     corners: Int[np.ndarray, " n"] = np.zeros(0, int)
+    tops: Int[np.ndarray, "h w"] | None = None
     pairs: Int[np.ndarray, "m 2"] = np.zeros((0, 2), int)
 
 
@@ -69,7 +77,7 @@ class _Part(NamedTuple):
         in_box: Share of it in the box of the object.
         in_reach: Share of it within the reach of the object.
         in_column: Share of it in the reach above and below the box.
-        is_corner: Whether it may be the corner of something nearer.
+        is_doubtful: Whether it may be the corner of something nearer, or the leg of a table.
     """
 
     frame: int
@@ -78,7 +86,7 @@ class _Part(NamedTuple):
     in_box: float
     in_reach: float
     in_column: float
-    is_corner: bool
+    is_doubtful: bool
 
 
 class _Known(NamedTuple):
@@ -111,7 +119,12 @@ def belonging(
     Returns:
         For each frame, True on the object `[h w]`.
     """
-    parts = [part for i, seen in enumerate(frames) for part in _parts(i, seen, box, reach, column)]
+    tops = [top for seen in frames for top in _tops(seen, box)]
+    parts = [
+        part._replace(is_doubtful=part.is_doubtful or _is_under(in_object(part.points, box), tops))
+        for i, seen in enumerate(frames)
+        for part in _parts(i, seen, box, reach, column)
+    ]
     sure = [seen.points[seen.sure & points_in_box(seen.points, reach)] for seen in frames]
     background = [_background(seen, column) for seen in frames]
     known = _Known(*_trees(sure, box), _tree(background))
@@ -125,6 +138,7 @@ def belonging(
         taken = {part[:2] for part in ours}
         apart = [part for part in parts if part[:2] not in taken and _is_apart(part)]
         known = known._replace(others=_tree([*background, *(part.points for part in apart)]))
+        ours = [part for part in ours if float(_foreign(part.points, known).mean()) < MOSTLY]
         before, whole = whole, {part[:2] for part in ours if _is_whole(part, known)}
         if whole == before:
             break
@@ -140,10 +154,10 @@ def belonging(
 def _is_ours(part: _Part, known: _Known, box: Box) -> bool:
     """Whether a part is the object, all of it or some.
 
-    What may be the corner of something nearer is so only if other frames show it as the object.
+    What may be something else is so only if other frames show it as the object.
     """
     again = float(_near(part.points, known.ours).mean())
-    if part.is_corner:
+    if part.is_doubtful:
         return again > MOSTLY
     return again > AGAIN or (part.in_box > MOSTLY and _adjoins(part, known.columns, box))
 
@@ -177,7 +191,8 @@ def _together(
         if (frame, int(a)) in sure
     }
     known = {part[:2] for part in ours}
-    found = [p for p in parts if p[:2] in partners - known and p.in_reach > WHOLLY]
+    may_be = [p for p in parts if p.in_reach > WHOLLY and not p.is_doubtful]
+    found = [p for p in may_be if p[:2] in partners - known]
     clouds = {i: _tree([p.points for p in found if p.frame != i]) for i in {p.frame for p in found}}
     return [p for p in found if float(_near(p.points, clouds[p.frame]).mean()) > MOSTLY]
 
@@ -241,6 +256,39 @@ def _parts(index: int, seen: Seen, box: Box, reach: Box, column: Box) -> list[_P
         some, is_corner = points[:: 1 + len(points) // _SAMPLE], bool(label in seen.corners)
         found.append(_Part(index, int(label), some, in_box, in_reach, in_column, is_corner))
     return found
+
+
+class _Top(NamedTuple):
+    """A table top in the frame of the object's box.
+
+    Attributes:
+        height: Its height, in metres.
+        hull: The lines around it `[n 3]`: x, z and 1 times each are negative inside.
+    """
+
+    height: float
+    hull: Float[np.ndarray, "n 3"]
+
+
+def _tops(seen: Seen, box: Box) -> list[_Top]:
+    """The table tops of a frame."""
+    if seen.tops is None:
+        return []
+    found = []
+    for number in range(1, seen.tops.max() + 1):
+        points = in_object(seen.points[seen.tops == number], box)
+        hull = ConvexHull(points[:, ::2]).equations
+        found.append(_Top(float(np.median(points[:, 1])), hull))
+    return found
+
+
+def _is_under(points: Float[np.ndarray, "n 3"], tops: list[_Top]) -> bool:
+    """Whether points in the frame of the box are below a table top."""
+    for top in tops:
+        outside = (points[:, ::2] @ top.hull[:, :2].T + top.hull[:, 2]).max(axis=1)
+        if float(((outside < EDGE) & (points[:, 1] < top.height)).mean()) > UNDER:
+            return True
+    return False
 
 
 def _background(seen: Seen, column: Box) -> Float[np.ndarray, "n 3"]:

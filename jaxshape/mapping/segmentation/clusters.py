@@ -130,8 +130,20 @@ def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> 
 # Background -----------------------------------------------------------------------------------
 
 
-def background(view: Scene, click: Pixel | None, *, with_tables: bool = True) -> Image:
-    """True on and behind floor and walls, and on table tops, unless they were clicked on.
+class Background(NamedTuple):
+    """What is no part of an object.
+
+    Attributes:
+        pixels: True on and behind floor and walls, and on table tops `[h w]`.
+        tops: Number of the table top of each pixel, from 1; 0 elsewhere `[h w]`.
+    """
+
+    pixels: Image
+    tops: Int[np.ndarray, "h w"]
+
+
+def background(view: Scene, click: Pixel | None, *, with_tables: bool = True) -> Background:
+    """Floor, walls and table tops, unless they were clicked on.
 
     Args:
         view: The reduced frame.
@@ -140,6 +152,7 @@ def background(view: Scene, click: Pixel | None, *, with_tables: bool = True) ->
     """
     floor = None if view.floor is None else view.floor.plane
     found = np.zeros(view.z.shape, bool) if floor is None else _beyond(view, floor)
+    tops = np.zeros(found.shape, int)
     for plane in view.planes:
         if plane is floor:
             continue
@@ -151,10 +164,11 @@ def background(view: Scene, click: Pixel | None, *, with_tables: bool = True) ->
         if _is_wall(plane, parts, sides, view):
             found |= _beyond(view, plane)
         is_table = with_tables and floor is not None and _is_table_top(plane, floor)
-        limit = TABLE if is_table else SHEET
         for part, side in zip(parts, sides, strict=True):
-            found |= part & (side > limit)
-    return found
+            if side > (TABLE if is_table else SHEET):
+                found |= part
+                tops[part] = is_table * (tops.max() + 1)
+    return Background(found, tops)
 
 
 def _beyond(view: Scene, plane: Plane) -> Image:

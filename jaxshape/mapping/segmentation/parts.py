@@ -27,6 +27,7 @@ class Parts(NamedTuple):
         sure: True on pixels that are known to show the object `[h w]`.
         corners: Labels of the clusters that may be corners of something nearer, of which the image
             shows no more `[n]`.
+        tops: Number of the table top of each pixel, from 1; 0 elsewhere `[h w]`.
         pairs: Pairs of labels of clusters that belong together in this frame `[m 2]`.
         floor: Normal of the floor, towards the camera, and the height of the camera above it in
             metres, in the frame of the camera `[4]`; NaN where no floor is seen.
@@ -37,6 +38,7 @@ class Parts(NamedTuple):
     labels: Int[np.ndarray, "h w"]
     sure: Bool[np.ndarray, "h w"]
     corners: Int[np.ndarray, " n"]
+    tops: Int[np.ndarray, "h w"]
     pairs: Int[np.ndarray, "m 2"]
     floor: Float[np.ndarray, " 4"]
     evidence: float
@@ -62,14 +64,15 @@ def parts_of(
         The clusters, and the floor with its evidence.
     """
     view = look(depth, K, stride=1)
-    free = np.isfinite(view.z) & ~background(view, None, with_tables=with_tables)
+    behind = background(view, None, with_tables=with_tables)
+    free = np.isfinite(view.z) & ~behind.pixels
     labels = clusters(view, free)
     at_border = np.array(corners(labels, view), int)
     together = np.array(pairs(labels, view), int).reshape(-1, 2)
     labels[free & (labels == 0)] = SPECK
     known = np.zeros(depth.shape, bool) if sure is None else sure
     if view.floor is None:
-        return Parts(labels, known, at_border, together, NO_FLOOR, 0.0)
+        return Parts(labels, known, at_border, behind.tops, together, NO_FLOOR, 0.0)
     plane = view.floor.plane
     floor = np.array([*plane.normal, plane.offset], np.float64)
-    return Parts(labels, known, at_border, together, floor, view.floor.confidence)
+    return Parts(labels, known, at_border, behind.tops, together, floor, view.floor.confidence)

@@ -47,7 +47,7 @@ def propose(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> tup
     if not measured.any():
         return ()
     view = look(depth, K)
-    labels = clusters(view, reduced(measured, view.stride) & ~background(view, None))
+    labels = clusters(view, reduced(measured, view.stride) & ~background(view, None).pixels)
     return tuple(
         Proposal(
             segmented=enlarged(pixels, view, depth) & measured,

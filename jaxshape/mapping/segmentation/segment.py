@@ -125,7 +125,7 @@ def segment(
     clicked = prompt.click is not None
     view = look(depth, K)
     target = _target(prompt, view)
-    behind = background(view, target if clicked else None)
+    behind = background(view, target if clicked else None).pixels
     labels = clusters(view, reduced(allowed, view.stride) & ~behind)
     if labels.max() == 0:
         return _nothing(measured, "Nothing but floor, walls and table tops is seen there")

@@ -40,7 +40,9 @@ def in_the_world(view):
 
 def seen(view, sure=None):
     parts = parts_of(view.depth, K, sure)
-    return Seen(in_the_world(view), parts.labels, parts.sure, parts.corners, parts.pairs)
+    return Seen(
+        in_the_world(view), parts.labels, parts.sure, parts.corners, parts.tops, parts.pairs
+    )
 
 
 def found_in(views, box, first=OURS):
@@ -77,6 +79,29 @@ def test_a_box_that_reaches_too_far_does_not_hold_the_table_beside(views):
         chair = (view.label == OURS) & (in_the_world(view)[..., 1] > 0.06)
         assert found[chair].mean() > 0.95
         assert not found[view.label == ITS_TABLE].any()
+
+
+def beside_its_leg(by):
+    """The table, moved so that a leg of it stands next to the chair."""
+    return [tuple(np.add(corner, (-by, 0, 0.35)) for corner in part) for part in TABLE]
+
+
+def test_the_leg_of_a_table_next_to_the_chair_stays_the_tables():
+    """Both parts adjoin, and the box reaches too far: what is under the table top is not taken."""
+    groups = [FLOOR, WALLS, CHAIR, beside_its_leg(0.36)]
+    eyes = [(0.3, 1.9, 2.2), (-0.4, 1.8, 2.3), (-1.0, 1.6, 1.9)]
+    views = [room(groups, eye, seed=i) for i, eye in enumerate(eyes)]
+    wide = box_of((-0.25, 0, -0.25), (0.6, 0.96, 0.4))
+    frames = [seen(view) for view in views]
+    frames[0] = frames[0]._replace(sure=views[0].label == OURS)
+    assert all(one.tops.any() for one in frames)
+    for view, found in zip(views[1:], belonging(frames, wide, *reach_of(wide))[1:], strict=True):
+        chair = (view.label == OURS) & (in_the_world(view)[..., 1] > 0.06)
+        assert found[chair].mean() > 0.9
+        assert found[view.label == ITS_TABLE].mean() < 0.01
+    blind = [one._replace(tops=None) for one in frames]
+    taken = belonging(blind, wide, *reach_of(wide))[1] & (views[1].label == ITS_TABLE)
+    assert taken.sum() > 30  # without the table top its leg is taken
 
 
 def open_back(gap):
