@@ -40,7 +40,7 @@ WRONG = {
     CameraConfig: {"camera": ("Kinect", ""), "noise": SWITCH, "fusion": ("tsdf",)},
     TrackingConfig: {"against": ("maps", "Map"), "on": ("objects",), "min_inliers": SHARE,
                      "sure_inliers": SHARE, "min_overlap": SHARE, "max_angle": POSITIVE,
-                     "max_distance": POSITIVE},
+                     "max_distance": POSITIVE, "correct_poses": SWITCH},
     MappingConfig: {"keyframe_angle": POSITIVE, "keyframe_distance": POSITIVE, "realign": SWITCH,
                     "isotropic": SWITCH, "fusion": ("point",), "depth_noise": POSITIVE,
                     "min_hits": COUNT, "keyframe_iterations": (*COUNT, 10**9)},

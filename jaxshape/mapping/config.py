@@ -27,6 +27,8 @@ class TrackingConfig:
             above 0.
         max_distance: Distance from the expected pose beyond which a pose is not believed, in
             metres, above 0.
+        correct_poses: Move keyframes whose poses are given, by little, to where they agree better
+            with the map: given poses drift, too. False takes all given poses as they are.
 
     Raises:
         ValueError: A setting is outside its range.
@@ -39,12 +41,14 @@ class TrackingConfig:
     min_overlap: float = 0.25
     max_angle: float = 35.0
     max_distance: float = 0.5
+    correct_poses: bool = True
 
     def __post_init__(self) -> None:
         checks.one_of("against", self.against, ("map", "keyframe"))
         checks.one_of("on", self.on, ("scene", "object"))
         for share in ("min_inliers", "sure_inliers", "min_overlap"):
             checks.within(share, getattr(self, share), 0, 1)
+        checks.one_of("correct_poses", self.correct_poses, (True, False))
         checks.positive("max_angle", self.max_angle, "degrees")
         checks.positive("max_distance", self.max_distance, "metres")
 

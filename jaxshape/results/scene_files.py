@@ -106,7 +106,8 @@ def write_scene_progress(
     write_json(folder / "keyframes.json", keyframe_entries(sequence, whole))
     meshes = list(filter(None, map(_measured_mesh, scene.objects)))
     if meshes:
-        write_mesh(trimesh.util.concatenate(meshes), folder / "mesh.ply")
+        together: Any = trimesh.util.concatenate(meshes)
+        write_mesh(together, folder / "mesh.ply")
     entries = [
         _place_of(one) | {"class": None, "size": one.progress.start.box.size.tolist()}
         for one in scene.objects

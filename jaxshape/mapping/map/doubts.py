@@ -22,6 +22,9 @@ LEGS = 0.15
 LEFT_OUT = 0.15
 """Share of what the first frame showed as the object from which its absence in the map is said."""
 
+MOVED = 0.01
+"""Metres by which a given pose was moved from which that is said."""
+
 _LOWEST = 0.5  # percent of the points that may lie below what counts as measured
 
 
@@ -42,8 +45,8 @@ ALL_SEEN = Unseen()
 
 
 def doubts_of(progress: Progress) -> tuple[str, ...]:
-    """Warnings of frames that cannot be read, of keyframes without the object, of what its box left
-    out, and of what was not seen of its box and its legs.
+    """Warnings of frames that cannot be read, of given poses that were moved, of keyframes without
+    the object, of what its box left out, and of what was not seen of its box and its legs.
 
     Args:
         progress: Progress of a recording.
@@ -53,9 +56,21 @@ def doubts_of(progress: Progress) -> tuple[str, ...]:
     """
     return (
         *unreadable(progress),
+        *_moved(progress),
         *_empty(progress),
         *_left_out(progress),
         *unseen_in_words(progress),
+    )
+
+
+def _moved(progress: Progress) -> tuple[str, ...]:
+    """Given poses that do not fit the depth images."""
+    moved = [log.figures["moved"] for log in progress.logs if "moved" in log.figures]
+    if max(moved, default=0) < MOVED:
+        return ()
+    return (
+        f"The given poses of {len(moved)} keyframes do not fit the depth images: they were moved, "
+        f"by up to {100 * max(moved):.0f} cm. Add --no-correct-poses to take them as they are.",
     )
 
 

@@ -1,6 +1,7 @@
 """The pose of a new frame in a map (paper, section 3.4), and whether the camera has moved. [host]
 
 localize    registration from the expected pose; where that fails, from many others
+corrected   registration from a given pose, where the frame then agrees better
 has_moved   whether a frame shows the object from elsewhere than the last keyframe
 """
 
@@ -20,6 +21,13 @@ from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame, object_
 from jaxshape.mapping.tracking.registration import displacement, doubt
 from jaxshape.mapping.tracking.surfels import Surface
 from jaxshape.mapping.tracking.views import DepthView
+
+BETTER = 0.01
+"""Share of the points, of those expected to be seen again, that more must agree for a given pose to
+be moved."""
+
+NEARBY = (0.15, 6.0)
+"""Metres and degrees by which a given pose is moved at most."""
 
 _JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess of the motion
 
@@ -53,6 +61,37 @@ def localize(
     if is_believed:
         return best, None
     return best, reason or doubt(best, T_expected, config)
+
+
+def corrected(
+    states: Sequence[MapState],
+    prepared: PreparedFrame,
+    T_world_camera: jaxlie.SE3,
+    config: TrackingConfig,
+) -> Alignment | None:
+    """The alignment of a frame whose pose was given, near that pose.
+
+    Args:
+        states: Maps of one or more objects with the same keyframes.
+        prepared: The frame.
+        T_world_camera: The given pose, in the world of the map.
+        config: Settings of tracking.
+
+    Returns:
+        None where the frame agrees no better elsewhere, or where nothing is sure.
+    """
+    state = states[0]
+    pixels = _tracked_pixels(states, prepared, T_world_camera, config)
+    T_keyframe, surfaces = state.keyframes[-1].T_world_camera, _surfaces(states, config)
+    at_given, found = _register_near(
+        prepared.view, pixels, state.view, T_keyframe, surfaces, T_world_camera
+    )
+    distance, angle = displacement(found.T_reference_source, T_world_camera)
+    is_near = distance < NEARBY[0] and angle < NEARBY[1]
+    is_sure = found.converged and found.inlier_fraction >= config.sure_inliers
+    is_better = found.inlier_fraction > at_given.inlier_fraction + BETTER
+    believed = is_near and is_sure and is_better and doubt(found, None, config) is None
+    return found if believed else None
 
 
 def _surfaces(states: Sequence[MapState], config: TrackingConfig) -> tuple[Surface, ...]:
@@ -120,6 +159,13 @@ def _match(reference, T_reference, surfaces):
 def _register(view, pixels, reference, T_reference, surfaces, T_expected):
     match = _match(reference, T_reference, surfaces)
     return registration.register(view, pixels, match, T_expected)
+
+
+@jax.jit
+def _register_near(view, pixels, reference, T_reference, surfaces, T_given):
+    match = _match(reference, T_reference, surfaces)
+    at_given = registration.agreement(view, pixels, match, T_given)
+    return at_given, registration.register(view, pixels, match, T_given)
 
 
 @jax.jit

@@ -52,8 +52,9 @@ class FrameLog(NamedTuple):
         keyframe: The keyframe, counted from 0, that the pose is relative to.
         T_keyframe_camera: Pose of the frame relative to that keyframe `[4 4]`; None where it has no
             pose.
-        figures: Inlier fraction, overlap, rmse in metres and conditioning of the alignment, and
-            seconds of each part (`seconds_track`, ...).
+        figures: Inlier fraction, overlap, rmse in metres and conditioning of the alignment; the
+            metres by which a given pose was moved (`moved`); seconds of each part
+            (`seconds_track`, ...).
     """
 
     index: int
@@ -239,6 +240,8 @@ def as_figures(step: Step) -> dict[str, float]:
     if step.alignment is not None:
         for name in ("inlier_fraction", "overlap", "rmse", "conditioning"):
             figures[name] = float(getattr(step.alignment, name))
+    if step.moved:
+        figures["moved"] = step.moved
     return figures
 
 

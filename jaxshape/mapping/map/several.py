@@ -17,7 +17,7 @@ from jaxtyping import Array, Key
 
 from jaxshape.geometry.grids import Grids, binary
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
-from jaxshape.mapping.map.localization import has_moved, localize, moved_to
+from jaxshape.mapping.map.localization import corrected, has_moved, localize, moved_to
 from jaxshape.mapping.map.state import (
     MapState,
     added,
@@ -30,6 +30,7 @@ from jaxshape.mapping.map.state import (
 )
 from jaxshape.mapping.tracking.icp import Alignment
 from jaxshape.mapping.tracking.keyframes import Cut, PreparedFrame, keyframe_of
+from jaxshape.mapping.tracking.registration import displacement
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.reconstruction import Reconstruction
 
@@ -41,10 +42,11 @@ class Step(NamedTuple):
         status: "keyframe", "tracked" or "lost".
         reason: Why the frame was lost, in a few words; empty where it was not.
         T_world_camera: Pose of the frame; None where it was lost.
-        alignment: Agreement of the frame with the map; None where the pose was given.
+        alignment: Agreement of the frame with the map; None where the given pose was taken.
         shape: The shape as refined after a keyframe, a batch of one; None where nothing was
             refined.
         seconds: Seconds of each part: "track", "cut", "fuse", "refine", "realign".
+        moved: Metres by which a given pose was moved.
     """
 
     status: str
@@ -53,6 +55,7 @@ class Step(NamedTuple):
     alignment: Alignment | None
     shape: Reconstruction | None
     seconds: dict[str, float]
+    moved: float = 0.0
 
 
 class Parts(NamedTuple):
@@ -103,6 +106,8 @@ def step_all(
 ) -> tuple[list[MapState], Step, Shapes]:
     """Track a frame, unless its pose is given, and map it if it has moved enough.
 
+    A keyframe whose pose is given is moved to where it agrees better with the map, by little.
+
     Args:
         members: The objects, one or more, with the settings of the first.
         prepared: The frame.
@@ -113,8 +118,8 @@ def step_all(
     """
     tracking, mapping = members[0].parts.tracking, members[0].parts.mapping
     states = [one.state for one in members]
-    clock, alignment, T = Clock(), None, T_given
-    if T is None:
+    clock, alignment, moved = Clock(), None, 0.0
+    if T_given is None:
         fused = [one.state for one in members if one.is_fused] or states[:1]
         alignment, reason = localize(fused, prepared, tracking)
         clock.lap("track", alignment)
@@ -123,13 +128,25 @@ def step_all(
             lost = Step("lost", reason, None, alignment, None, clock.seconds)
             return still, lost, [None] * len(states)
         T = alignment.T_reference_source
+    else:
+        T = states[0].T_world_given @ T_given
+    judges = [one.state for one in members if one.is_fused] or states
+    is_keyframe = any(has_moved(one, T, mapping) for one in judges)
+    if is_keyframe and T_given is not None and tracking.correct_poses:
+        alignment = corrected(judges, prepared, T, tracking)
+        clock.lap("track", alignment)
+        if alignment is not None:
+            moved, _ = displacement(T, alignment.T_reference_source)
+            T = alignment.T_reference_source
+            T_world_given = (T @ T_given.inverse()).normalize()
+            states = [one._replace(T_world_given=T_world_given) for one in states]
     states = [moved_to(one, T) for one in states]
-    judges = [state for one, state in zip(members, states, strict=True) if one.is_fused]
-    if not any(has_moved(one, T, mapping) for one in judges or states):
+    if not is_keyframe:
         tracked = Step("tracked", "", T, alignment, None, clock.seconds)
         return states, tracked, [None] * len(states)
     members = [one._replace(state=state) for one, state in zip(members, states, strict=True)]
-    return _mapped(members, prepared, alignment, clock)
+    states, step, shapes = _mapped(members, prepared, alignment, clock)
+    return states, step._replace(moved=moved), shapes
 
 
 def _mapped(

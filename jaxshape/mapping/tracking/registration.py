@@ -44,6 +44,14 @@ def register(
     return _descend(view, segmented, match, T_reference_camera, LEVELS)
 
 
+def agreement(
+    view: DepthView, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
+) -> Alignment:
+    """How well the segmented pixels of a view agree with a reference at a pose, as it is."""
+    finest = LEVELS[-1]._replace(iterations=0)
+    return _descend(view, segmented, match, T_reference_camera, (finest,))
+
+
 def register_from(
     view: DepthView, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
 ) -> Alignment:

@@ -23,6 +23,7 @@ from jaxshape.data.sequences import SequenceError, open_sequence
 from jaxshape.geometry import fusion, grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
 from jaxshape.geometry.overlap import iou
+from jaxshape.mapping.map.doubts import doubts_of
 from jaxshape.mapping.map.recording import FrameLog, Progress, trajectory
 from jaxshape.mapping.placement import finding
 from jaxshape.mapping.placement.finding import Start, find_start
@@ -87,6 +88,26 @@ def test_given_poses_are_taken_as_they_are(given, walk):
     for index, T in trajectory(given).items():
         np.testing.assert_allclose(T, walk.T_world_camera[index], atol=1e-5)
     assert all("inlier_fraction" not in log.figures for log in given.logs)
+
+
+def drift(index):
+    """The pose of a camera whose own map has slipped: farther to the side with every frame."""
+    off = np.eye(4)
+    off[:3, 3] = 0.008 * index * np.array([0.6, 0.0, 0.8])
+    return off
+
+
+def test_given_poses_that_drift_are_moved_to_where_the_frames_agree(followed, copy, walk):
+    for i, T in enumerate(walk.T_world_camera):
+        np.savetxt(copy / f"frame-{i:06d}.pose.txt", drift(i) @ T)
+    progress = followed(copy, use_poses=True)
+    moved = [log for log in progress.logs if "moved" in log.figures]
+    assert moved and max(log.figures["moved"] for log in moved) > 0.01
+    last = progress.logs[-1].index
+    given, _ = pose_errors(drift(last) @ walk.T_world_camera[last], walk.T_world_camera[last])
+    found = {i: pose_errors(T, walk.T_world_camera[i])[0] for i, T in trajectory(progress).items()}
+    assert given > 10 and found[last] < 0.2 * given
+    assert any("do not fit the depth images" in sentence for sentence in doubts_of(progress))
 
 
 def test_frames_whose_pose_is_missing_are_tracked(followed, copy, walk):
