@@ -137,7 +137,7 @@ def searches(prior: ShapePrior, budget: int) -> dict[str, Search]:
         refiner = built(method, population=size, sigma0=TUNED["CMA-ES"][1].sigma0)
         return Search(refiner, iterations, size * iterations, "raw")
 
-    def descent(method: str, step_size: float | None = None, space: Any = "whitened") -> Search:
+    def descent(method: str, step_size: Any = None, space: Any = "whitened") -> Search:
         refiner = built(method, tolerance=0.0, step_size=step_size)
         return Search(refiner, budget // GRADIENT, 0, space)
 

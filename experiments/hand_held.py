@@ -182,7 +182,8 @@ def _in_a_room(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         ),
     ]
     room = [trimesh.creation.box(bounds=np.array(corners, float)) for corners in boxes]
-    return trimesh.util.concatenate([mesh, *room])
+    together: Any = trimesh.util.concatenate([mesh, *room])
+    return together
 
 
 def _path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarray:

@@ -34,6 +34,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
+from jaxshape.data.config import CameraName
 from jaxshape.data.dataset import open_dataset
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.grids import Grids
@@ -68,7 +69,10 @@ NETWORKS: dict[str, TrainConfig] = {
         AUTOENCODER, architecture=replace(AUTOENCODER.architecture, occlusion=True)
     ),
 }
-CAMERAS = {"paper, clean": ("paper", False), "kinect, noisy": ("kinect", True)}
+CAMERAS: dict[str, tuple[CameraName, bool]] = {
+    "paper, clean": ("paper", False),
+    "kinect, noisy": ("kinect", True),
+}
 FRAMES = (1, 4, 8, 18)
 
 # A search for which the U-Net takes the place of the decoded first code.

@@ -19,13 +19,13 @@ import sys
 import time
 from pathlib import Path
 
-import bpy
+import bpy  # pyright: ignore[reportMissingImports]
 import numpy as np
 import trimesh
-from infinigen.assets.objects.seating.chairs.bar_chair import BarChairFactory
-from infinigen.assets.objects.seating.chairs.chair import ChairFactory
-from infinigen.assets.objects.seating.chairs.office_chair import OfficeChairFactory
-from infinigen.assets.objects.seating.sofa import ArmChairFactory, SofaFactory
+from infinigen.assets.objects.seating.chairs.bar_chair import BarChairFactory  # pyright: ignore[reportMissingImports]
+from infinigen.assets.objects.seating.chairs.chair import ChairFactory  # pyright: ignore[reportMissingImports]
+from infinigen.assets.objects.seating.chairs.office_chair import OfficeChairFactory  # pyright: ignore[reportMissingImports]
+from infinigen.assets.objects.seating.sofa import ArmChairFactory, SofaFactory  # pyright: ignore[reportMissingImports]
 
 GENERATORS = {
     "chair": ChairFactory,

@@ -156,6 +156,7 @@ def rebuilder(prior: ShapePrior, iterations: int):
     """A compiled function that rebuilds a batch of cases each way, and scores them."""
     config = RefineConfig(iterations=iterations)
     refiner = refiner_for("gradient:adam", prior, config)
+    assert refiner is not None
 
     def search(prior: ShapePrior, code: jax.Array, targets: Target) -> jax.Array:
         key, space = jax.random.key(0), search_space(prior, config)  # Adam draws no numbers

@@ -145,9 +145,10 @@ def by_residual(residual: Residual, prior: ShapePrior, iterations: int) -> Conte
     def contest(keys, prior: ShapePrior, case: Case):
         grids = case.grids
         code = encode(prior, grids)
+        occluded = jnp.asarray(grids.occluded)
         anchor = logits = decode(prior, code)
         for scale in residual.prior_scales:
-            alpha = scale if residual.alpha_is_printed else scale / printed_alpha(grids.occluded)
+            alpha = scale if residual.alpha_is_printed else scale / printed_alpha(occluded)
             # Weights relative to measured surface; a common factor does not change Adam.
             weights = Weights(1 / residual.occupied_weight, alpha / residual.occupied_weight)
             targets = weigh(grids, anchor, weights)

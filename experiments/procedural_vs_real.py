@@ -152,7 +152,8 @@ def leg_thickness(
 
 def components(surface: Bool[np.ndarray, "x y z"]) -> tuple[Int[np.ndarray, "x z"], int]:
     """The pieces, labelled from 1, into which the layer near the floor falls."""
-    return ndimage.label(surface[:, LEG_LAYER].any(axis=1), np.ones((3, 3)))
+    found: Any = ndimage.label(surface[:, LEG_LAYER].any(axis=1), np.ones((3, 3)))
+    return found
 
 
 def back_thickness(
@@ -226,7 +227,7 @@ def grid_statistics(seats: Seats) -> dict[str, Float[np.ndarray, " n"]]:
     surface, seat = seats.surface, seat_layer(seats.surface)
     above = surface & (Y > seat[:, None, None, None] + 2)
     occupied = surface.sum((1, 2, 3))
-    has_back, outline = back_of(surface, seat), above.any(axis=3)
+    has_back, outline = back_of(surface, seat), np.asarray(above.any(axis=3))
     width, height, depth = seats.extents.T
     return {
         "width / height": width / height,
@@ -347,9 +348,10 @@ def compare(ours: Float[np.ndarray, " n"], real: Float[np.ndarray, " m"]) -> dic
         return {}
     low, high = np.percentile(ours, (1, 99))
     distance = stats.wasserstein_distance(ours, real) / max(real.std(), 1e-9)
+    smirnov: Any = stats.ks_2samp(ours, real)
     return {
         "covered": _round(np.mean((low <= real) & (real <= high))),
-        "KS": _round(stats.ks_2samp(ours, real).statistic),
+        "KS": _round(smirnov.statistic),
         "Wasserstein": _round(distance),
     }
 

@@ -181,7 +181,8 @@ def record(folder: Path, truth: list[Placed], frames: int, seed: int) -> None:
     ]
     T = path(whole.bounds, frames, rng)
     written = np.array([_shaken(one, rng) for one in T])
-    film(folder, trimesh.util.concatenate([*meshes, *room]), T, SHAPE, FOCAL, rng, written)
+    together: Any = trimesh.util.concatenate([*meshes, *room])
+    film(folder, together, T, SHAPE, FOCAL, rng, written)
 
 
 def path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarray:
@@ -270,6 +271,7 @@ def compared(one: Placed, found: SceneObject | None) -> dict[str, Any]:
 
 def mesh_iou(one: Placed, found: SceneObject) -> float:
     """IoU of surface voxels in the true box."""
+    assert found.progress.shape is not None
     shape = only(found.progress.shape)
     observation = observation_of(found.progress.state)
     mesh = shape_mesh(observation, shape.composed, shape.fill_logits).mesh

@@ -154,7 +154,8 @@ def _both(points: Float[np.ndarray, "n 3"], mesh: trimesh.Trimesh) -> list[float
 
 def distances(points: Float[np.ndarray, "n 3"], mesh: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
     """Metres to the triangles that hold the nearest of many points on the surface."""
-    samples, face = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    sampled: Any = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    samples, face = sampled
     _, nearest = KDTree(samples).query(points, k=3)
     to_triangle = partial(_to_triangles, points, mesh.triangles)
     return np.min([to_triangle(face[nearest[:, i]]) for i in range(3)], axis=0)
@@ -181,8 +182,8 @@ def visible_points(truth: trimesh.Trimesh, captured: Capture) -> Float[np.ndarra
 
 def open3d_mesh(captured: Capture) -> trimesh.Trimesh:
     """The mesh of Open3D's block grid of signed distances, truncated at 4 voxels."""
-    import open3d as o3d
-    import open3d.core as o3c
+    import open3d as o3d  # pyright: ignore[reportMissingImports]
+    import open3d.core as o3c  # pyright: ignore[reportMissingImports]
 
     fx, fy, cx, cy = map(float, captured.intrinsics)
     lens = o3c.Tensor(np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1.0]]))

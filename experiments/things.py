@@ -3,6 +3,8 @@
 Made of trimesh's primitives, +y up, metres, their boxes centred at the origin.
 """
 
+from typing import Any
+
 import numpy as np
 import trimesh
 
@@ -36,7 +38,7 @@ def _plant(rng: np.random.Generator) -> trimesh.Trimesh:
         y = height + stem * rng.uniform(0.4, 1.1)
         leaf.apply_translation([spread * np.cos(angle), y, spread * np.sin(angle)])
         parts.append(leaf)
-    return trimesh.util.concatenate(parts)
+    return _together(parts)
 
 
 def _lamp(rng: np.random.Generator) -> trimesh.Trimesh:
@@ -45,9 +47,12 @@ def _lamp(rng: np.random.Generator) -> trimesh.Trimesh:
     shade = trimesh.creation.cone(rng.uniform(0.18, 0.3), rng.uniform(0.25, 0.4), sections=24)
     shade.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
     shade.apply_translation([0, height - 0.1, 0])
-    return trimesh.util.concatenate(
-        [_upright(rng.uniform(0.12, 0.2), 0.03, 0), _upright(0.02, height, 0), shade]
-    )
+    return _together([_upright(rng.uniform(0.12, 0.2), 0.03, 0), _upright(0.02, height, 0), shade])
+
+
+def _together(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    mesh: Any = trimesh.util.concatenate(parts)
+    return mesh
 
 
 def _bin(rng: np.random.Generator) -> trimesh.Trimesh:

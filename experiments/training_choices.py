@@ -35,13 +35,14 @@ from matplotlib.figure import Figure
 
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.config import DatasetConfig, FaultConfig, InputConfig
-from jaxshape.data.dataset import TEST_SEEDS, Dataset, hash_seed, load_object, open_dataset
+from jaxshape.data.dataset import Dataset, Object, hash_seed, load_object, open_dataset
+from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.data.paths import draw_path
 from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
-from jaxshape.model.config import PRESETS, Architecture, Completion, TrainConfig
+from jaxshape.model.config import PRESETS, Architecture, TrainConfig
 from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.model.training import finished_prior, train
 from jaxshape.report.palette import COLORS
@@ -61,9 +62,6 @@ FAULTY = DatasetConfig(
 
 # Each group changes one thing. The others of a group are compared with its first.
 PLAIN = replace(PRESETS["autoencoder"], architecture=SMALL, inputs=UNCHANGED, occupied_weight=1.0)
-CONDITIONAL = replace(
-    PRESETS["default"], architecture=Completion((16, 48, 64), 1), inputs=UNCHANGED, average=0.98
-)
 
 
 def _inputs(**changes: Any) -> TrainConfig:
@@ -92,10 +90,6 @@ VARIANTS: dict[str, TrainConfig] = {
     "code noise 0.1": replace(PLAIN, code_noise=0.1),
     "code noise 0.3": replace(PLAIN, code_noise=0.3),
     "KL 1": replace(PLAIN, code_noise=1.0, code_weight=1.0),
-    "conditional": CONDITIONAL,
-    "conditional, KL 0.1": replace(CONDITIONAL, code_weight=0.1),
-    "conditional, KL 10": replace(CONDITIONAL, code_weight=10.0),
-    "conditional, occluded x 1": replace(CONDITIONAL, occluded_weight=1.0),
 }
 GROUPS = {
     "inputs": ["plain", "complete surfaces", "mirror", "warp"],
@@ -103,8 +97,6 @@ GROUPS = {
     "loss": ["plain", "occupied x 1.5", "occupied x 2", "occluded x 2", "trained by Adam"],
     "space": ["plain", "code 32", "code 64", "code 200", "decoder half", "decoder double",
               "code noise 0.1", "code noise 0.3", "KL 1"],
-    "conditional": ["plain", "conditional", "conditional, KL 0.1", "conditional, KL 10",
-                    "conditional, occluded x 1"],
 }  # fmt: skip
 
 
@@ -142,6 +134,7 @@ Faulty = tuple[Grids, np.ndarray]
 def examples(name: str, config: Config) -> Dataset:
     """Half of the objects, the same for all variants but the one that is about the objects."""
     if name == "box chairs":
+        assert config.boxes is not None
         return open_dataset(config.boxes)
     dataset = open_dataset(config.dataset)
     half = slice(len(dataset.names) // 2)
@@ -165,6 +158,11 @@ def judge(
     return found
 
 
+def loaded(objects: Sequence[Object]) -> list[Model]:
+    """The objects that can be used."""
+    return [one for one in map(load_object, objects) if isinstance(one, Model)]
+
+
 def faulty_pairs(models: Sequence[Model]) -> Faulty:
     """Three inputs of each model with every fault at once, sensor noise included, and the truth."""
     paths = [draw_path(m.mesh, FAULTY, hash_seed(7, i)) for i, m in enumerate(models)]
@@ -177,10 +175,10 @@ def run(config: Config) -> dict[str, Any]:
     """Train and judge every variant that has not been yet."""
     path = config.results / "training_choices.json"
     found = json.loads(path.read_text()) if path.exists() and not config.smoke else {}
-    chairs = [load_object(TEST_SEEDS + i) for i in range(config.chairs)]
+    chairs = loaded(procedural_objects("chair", config.chairs, TEST_SEEDS))
     tests: dict[str, Any] = {"procedural": chairs}
     if config.meshes:
-        tests["meshes"] = [load_object(s) for s in list_meshes(config.meshes)[:: config.every]]
+        tests["meshes"] = loaded(list_meshes(config.meshes)[:: config.every])
     faulty = faulty_pairs(chairs)
     for name in config.variants:
         if name == "box chairs" and not config.boxes:

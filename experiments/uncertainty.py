@@ -97,6 +97,7 @@ def conditional(prior: ShapePrior, keys, grids: Grids) -> tuple[jax.Array, jax.A
     """The first code's shape, and the spread of samples of the conditional prior."""
     config = RefineConfig(samples=SAMPLES)
     found = reconstruct(keys, prior, grids.occupied, grids.occluded, None, config)
+    assert found.samples is not None
     return found.fill_logits, jnp.std(found.samples, axis=1)
 
 
@@ -105,6 +106,7 @@ def curvature(prior: ShapePrior, keys, grids: Grids) -> tuple[jax.Array, jax.Arr
     config = RefineConfig(samples=SAMPLES, iterations=STEPS)
     adam = refiner_for("gradient:adam", prior, config)
     found = reconstruct(keys, prior, grids.occupied, grids.occluded, adam, config)
+    assert found.samples is not None
     return found.fill_logits, jnp.std(found.samples, axis=1)
 
 
@@ -114,6 +116,7 @@ def covariance(scale: float, prior: ShapePrior, keys, grids: Grids):
     residual, first = residual_for(grids, config), encode(prior, grids)
     target = jax.vmap(residual.target)(grids, decode(prior, first, grids))
     search = refiner_for("cma", prior, config)
+    assert search is not None
     found = refine(keys, prior, first, target, search, STEPS, residual=residual, space=space)
     mean, C = found.state.mean, found.state.covariance
     size = jnp.trace(C, axis1=1, axis2=2)[:, None, None] / C.shape[-1]
@@ -229,6 +232,7 @@ def two_kinds(config: Config, cases: list[tuple[str, Case]], path: Path) -> str:
     @jax.jit
     def look(keys, grids):
         found = reconstruct(keys, prior, grids.occupied, grids.occluded, None, search)
+        assert found.samples is not None
         unknown = grids.occluded[0] > 0.5
         chosen, share = hypotheses(found.samples[0], unknown, 2)
         a, b = ((found.samples[0, i] > 0) & unknown for i in chosen)
