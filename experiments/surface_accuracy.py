@@ -155,8 +155,8 @@ def _both(points: Float[np.ndarray, "n 3"], mesh: trimesh.Trimesh) -> list[float
 def distances(points: Float[np.ndarray, "n 3"], mesh: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
     """Metres to the triangles that hold the nearest of many points on the surface."""
     sampled: Any = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
-    samples, face = sampled
-    _, nearest = KDTree(samples).query(points, k=3)
+    samples, face = map(np.asarray, sampled)
+    nearest = np.asarray(KDTree(samples).query(points, k=3)[1])
     to_triangle = partial(_to_triangles, points, mesh.triangles)
     return np.min([to_triangle(face[nearest[:, i]]) for i in range(3)], axis=0)
 

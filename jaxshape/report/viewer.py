@@ -91,7 +91,7 @@ class LiveView:
             for name, layer in LAYERS.items():
                 self.boxes[name] = gui.add_checkbox(layer.label, layer.shown)
                 self.boxes[name].on_update(lambda _: self._show())
-            self.paint = gui.add_dropdown("Mesh in", (PLAIN,), visible=False)
+            self.paint: Any = gui.add_dropdown("Mesh in", (PLAIN,), visible=False)
             self.paint.on_update(lambda _: self._scene())
         with gui.add_folder("Keyframe") as self.keyframes:
             self.slider = gui.add_slider("number", 0, 1, 1, 1)
