@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo docs notebooks paper test test-slow fuzz kills audit lowest wheel lint clean
+.PHONY: install demo docs notebooks paper test test-slow fuzz kills soak audit lowest wheel lint clean
 
 install: $(VENV)/.runtime
 
@@ -67,6 +67,14 @@ KILLS ?= 50
 
 kills: $(VENV)/.develop
 	$(BIN)/python tests/kills.py --kills $(KILLS)
+
+# Many recordings in one process and in many, and a dataset of many meshes. About two hours on two
+# cores.
+RECORDINGS ?= 200
+MESHES ?= 10000
+
+soak: $(VENV)/.develop
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/soak.py --recordings $(RECORDINGS) --meshes $(MESHES)
 
 # Known vulnerabilities of what is installed.
 audit: $(VENV)/.develop
