@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from jaxshape.report.palette import GREY, STATUS_COLORS
 from jaxshape.results.folder import KeyframeRecord, ResultFolder, entries_of_objects
-from jaxshape.results.summary import number
+from jaxshape.results.summary import entries, number
 
 
 class Column(NamedTuple):
@@ -68,7 +68,9 @@ def objects(found: ResultFolder) -> str:
         return ""
     rows = map(_object_row, entries_of_objects(found.result))
     heading = ("object", "class", "sure", "width × height × depth", "verdict")
-    events = "".join(f"<li>{escape(str(event))}</li>" for event in found.result.get("events") or ())
+    events = "".join(
+        f"<li>{escape(str(event))}</li>" for event in entries(found.result.get("events"))
+    )
     about = (
         '<p class="soft">An object of no class is kept as it was measured; nothing is added to '
         "it.</p>"
@@ -78,9 +80,8 @@ def objects(found: ResultFolder) -> str:
 
 
 def _object_row(one: dict[str, Any]) -> tuple[str, ...]:
-    reasons = "; ".join(map(str, one.get("verdict_reasons") or ()))
-    size = one.get("size")
-    extents = " × ".join(number(x, 2) for x in size) if isinstance(size, list) else ""
+    reasons = "; ".join(map(str, entries(one.get("verdict_reasons"))))
+    extents = " × ".join(number(x, 2) for x in entries(one.get("size")))
     verdict = f"{one.get('verdict') or ''}{': ' if reasons else ''}{reasons}"
     cells = (
         str(one.get("name", "")),

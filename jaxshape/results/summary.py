@@ -63,7 +63,7 @@ def verdict_in_words(result: dict[str, Any]) -> str:
     """The verdict of a result as a sentence, with the object's size; empty without one."""
     if "verdict" not in result:
         return ""
-    reasons = "; ".join(map(str, result.get("verdict_reasons") or ()))
+    reasons = "; ".join(map(str, entries(result.get("verdict_reasons"))))
     because = f" because {reasons}" if reasons else ""
     return f"verdict: {result['verdict']}{because}. The object is {_size(result)}."
 
@@ -76,8 +76,8 @@ def objects_in_words(result: dict[str, Any]) -> Iterator[str]:
             what = f"{kind} ({number(one['sure'], times=100.0)}% sure)"
         else:
             what = "not decided yet"
-        size = " x ".join(number(side, 2) for side in one.get("size") or ())
-        reasons = "; ".join(map(str, one.get("verdict_reasons") or ()))
+        size = " x ".join(number(side, 2) for side in entries(one.get("size")))
+        reasons = "; ".join(map(str, entries(one.get("verdict_reasons"))))
         because = f" because {reasons}" if reasons else ""
         verdict = f", {one['verdict']}{because}" if one.get("verdict") else ""
         yield f"{one.get('name')}: {what}, {size} m{verdict}"
@@ -88,7 +88,7 @@ def _judgement(result: dict[str, Any]) -> Iterator[Figure]:
     quality = result.get("quality")
     if "verdict" not in result or not isinstance(quality, dict):
         return
-    reasons = "; ".join(map(str, result.get("verdict_reasons") or ()))
+    reasons = "; ".join(map(str, entries(result.get("verdict_reasons"))))
     yield Figure("Verdict", str(result["verdict"]), reasons or "nothing speaks against the result")
     yield Figure("Size", _size(result), "width, height and depth of the object")
     percent = {"times": 100.0, "unit": " %"}
@@ -107,7 +107,7 @@ def _judgement(result: dict[str, Any]) -> Iterator[Figure]:
 
 def _size(result: dict[str, Any]) -> str:
     """Width, height and depth in metres."""
-    sides = (result.get("quality") or {}).get("size") or ()
+    sides = entries((result.get("quality") or {}).get("size"))
     return " x ".join(number(side, 2) for side in sides) + " m"
 
 
@@ -136,6 +136,11 @@ def tracked(keyframe: KeyframeRecord) -> str:
     inliers, rmse = keyframe.figures.get("inlier_fraction"), keyframe.figures.get("rmse")
     agree = number(inliers, 0, times=100.0, unit=" % inliers")
     return ", ".join(filter(None, (agree, number(rmse, 1, times=1000.0, unit=" mm"))))
+
+
+def entries(value: Any) -> list[Any]:
+    """A list, or an empty one in place of anything else, as in a damaged result."""
+    return value if isinstance(value, list) else []
 
 
 def number(value: Any, digits: int = 0, *, times: float = 1.0, unit: str = "") -> str:

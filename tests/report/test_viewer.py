@@ -170,7 +170,9 @@ def test_the_objects_of_a_room_stand_in_their_boxes(tmp_path, open_view):
     T[:3, 3] = 1, 2, 3
     box = {"T_world_object": T.tolist(), "size": [0.5, 0.9, 0.6]}
     damaged = {"name": "object-3", "T_world_object": "here", "size": [1, 1, 1]}
-    entries = [{"name": "chair-1", "class": "chair", "sure": 0.9, **box}, damaged, "no object"]
+    worse = {"name": 4, "size": 5, "sure": "so", "verdict": "good", "verdict_reasons": 6}
+    first = {"name": "chair-1", "class": "chair", "sure": 0.9, **box}
+    entries = [first, damaged, "no object", worse]
     content = {"objects": entries}
     (tmp_path / "scene.json").write_text(json.dumps(content | {"running": True}))
     live = open_view(tmp_path)
