@@ -53,6 +53,7 @@ NOT_RUN = {
     "make lint": "runs other programs",
     "make fuzz": "takes twenty minutes",
     "make kills": "takes an hour",
+    "make soak": "takes two hours",
     "make test-slow": "runs this",
     "git clone <this repository> && cd jaxshape": "fetches",
     "pip install jaxshape": "installs",
