@@ -57,7 +57,6 @@ def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> No
         "logits": state.logits,
         "T_world_camera": state.T_world_camera.wxyz_xyz,
         "T_before_last": state.T_before_last.wxyz_xyz,
-        "T_world_given": state.T_world_given.wxyz_xyz,
         "start": start.T_world_camera,
         "box": start.box.T_world_object,
         "size": start.box.size,
@@ -194,7 +193,6 @@ def _state(
         T_world_camera=jaxlie.SE3(jnp.asarray(kept["T_world_camera"])),
         T_before_last=jaxlie.SE3(jnp.asarray(kept["T_before_last"])),
         poses_are_given=about["poses_are_given"],
-        T_world_given=jaxlie.SE3(jnp.asarray(kept["T_world_given"])),
     )
 
 

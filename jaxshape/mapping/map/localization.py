@@ -74,7 +74,7 @@ def corrected(
     Args:
         states: Maps of one or more objects with the same keyframes.
         prepared: The frame.
-        T_world_camera: The given pose, in the world of the map.
+        T_world_camera: The given pose.
         config: Settings of tracking.
 
     Returns:

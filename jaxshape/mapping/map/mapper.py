@@ -199,7 +199,6 @@ def placed_in(
         T_world_camera=state.T_world_camera,
         T_before_last=state.T_before_last,
         poses_are_given=state.poses_are_given,
-        T_world_given=state.T_world_given,
     )
 
 

@@ -129,7 +129,7 @@ def step_all(
             return still, lost, [None] * len(states)
         T = alignment.T_reference_source
     else:
-        T = states[0].T_world_given @ T_given
+        T = T_given
     judges = [one.state for one in members if one.is_fused] or states
     is_keyframe = any(has_moved(one, T, mapping) for one in judges)
     if is_keyframe and T_given is not None and tracking.correct_poses:
@@ -138,8 +138,6 @@ def step_all(
         if alignment is not None:
             moved, _ = displacement(T, alignment.T_reference_source)
             T = alignment.T_reference_source
-            T_world_given = (T @ T_given.inverse()).normalize()
-            states = [one._replace(T_world_given=T_world_given) for one in states]
     states = [moved_to(one, T) for one in states]
     if not is_keyframe:
         tracked = Step("tracked", "", T, alignment, None, clock.seconds)

@@ -61,8 +61,6 @@ class MapState(NamedTuple):
         T_world_camera: Pose of the last frame that was tracked.
         T_before_last: Motion of the camera to that frame from the one before.
         poses_are_given: Whether the poses were given, so that keyframes are not realigned.
-        T_world_given: From the world of the given poses to that of the map: the correction of the
-            last keyframe that was moved.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -77,7 +75,6 @@ class MapState(NamedTuple):
     T_world_camera: jaxlie.SE3
     T_before_last: jaxlie.SE3
     poses_are_given: bool
-    T_world_given: jaxlie.SE3
 
 
 def assemble(
@@ -92,7 +89,6 @@ def assemble(
     T_world_camera: jaxlie.SE3 | None = None,
     T_before_last: jaxlie.SE3 | None = None,
     poses_are_given: bool = False,
-    T_world_given: jaxlie.SE3 | None = None,
 ) -> MapState:
     """The state of a map with these keyframes.
 
@@ -107,7 +103,6 @@ def assemble(
         T_world_camera: Pose of the last frame that was tracked; None for that of the last keyframe.
         T_before_last: Motion of the camera before that frame; None where there was none since.
         poses_are_given: Whether the poses were given.
-        T_world_given: Correction of the given poses; None for none.
     """
     fusing = fusing_of(mapping, prior.resolution)
     state = MapState(
@@ -123,7 +118,6 @@ def assemble(
         T_world_camera=T_world_camera or keyframes[-1].T_world_camera,
         T_before_last=T_before_last or jaxlie.SE3.identity(),
         poses_are_given=poses_are_given,
-        T_world_given=T_world_given or jaxlie.SE3.identity(),
     )
     return with_surface(fused_anew(state))
 
