@@ -15,7 +15,6 @@ import io
 import os
 import resource
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -25,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from kills import differences
+from kills import differences, run
 from orbit_recording import record, write_recording
 
 from jaxshape.cli import main as command
@@ -66,16 +65,15 @@ def recordings(folder: Path, count: int) -> Iterator[Path]:
         yield frames
 
 
-def arguments(frames: Path, output: Path) -> list[str]:
-    box = str(frames / "box.json")
-    return ["reconstruct", str(frames), "--box", box, *FEW, "--output", str(output)]
+def arguments(frames: Path) -> list[str]:
+    return ["reconstruct", str(frames), "--box", str(frames / "box.json"), *FEW]
 
 
 def in_one_process(folder: Path, made: list[Path]) -> tuple[list[Use], list[str]]:
     """Rebuild all recordings here; what this process holds after each, and what went wrong."""
     held, wrong = [], []
     for i, frames in enumerate(made):
-        sys.argv = ["jaxshape", *arguments(frames, folder / f"one-{i}")]
+        sys.argv = ["jaxshape", *arguments(frames), "--output", str(folder / f"one-{i}")]
         said = io.StringIO()
         try:
             with contextlib.redirect_stdout(said):
@@ -92,9 +90,7 @@ def in_many_processes(folder: Path, made: list[Path], together: int) -> list[str
 
     def rebuilt(i: int) -> list[str]:
         output, log = folder / f"many-{i}", folder / f"many-{i}.txt"
-        argv = [sys.executable, "-m", "jaxshape.cli", *arguments(made[i], output)]
-        with open(log, "wb") as told:
-            status = subprocess.run(argv, stdout=told, stderr=told, check=False).returncode
+        status = run(arguments(made[i]), output, None, log)
         if status not in (0, 3):
             return [f"recording {i}: exit status {status}, see {log}"]
         return [f"recording {i}: {name}" for name in differences(output, folder / f"one-{i}")]
@@ -165,12 +161,9 @@ def soak_meshes(folder: Path, count: int) -> bool:
 
     damaged, output = write_meshes(folder / "meshes", count), folder / "dataset"
     shutil.rmtree(output, ignore_errors=True)
-    argv = [sys.executable, "-m", "jaxshape.cli", "dataset", "--meshes", str(folder / "meshes")]
     began = time.monotonic()
-    with open(folder / "dataset.txt", "wb") as told:
-        status = subprocess.run(
-            [*argv, *SMALL, "--output", str(output)], stdout=told, stderr=told, check=False
-        ).returncode
+    building = ["dataset", "--meshes", str(folder / "meshes"), *SMALL]
+    status = run(building, output, None, folder / "dataset.txt")
     lasted = time.monotonic() - began
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
     built = len(open_dataset(output).names) if status == 0 else 0

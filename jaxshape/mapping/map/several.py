@@ -118,9 +118,9 @@ def step_all(
     """
     tracking, mapping = members[0].parts.tracking, members[0].parts.mapping
     states = [one.state for one in members]
+    fused = [one.state for one in members if one.is_fused] or states[:1]
     clock, alignment, moved = Clock(), None, 0.0
     if T_given is None:
-        fused = [one.state for one in members if one.is_fused] or states[:1]
         alignment, reason = localize(fused, prepared, tracking)
         clock.lap("track", alignment)
         if reason is not None:
@@ -130,10 +130,9 @@ def step_all(
         T = alignment.T_reference_source
     else:
         T = T_given
-    judges = [one.state for one in members if one.is_fused] or states
-    is_keyframe = any(has_moved(one, T, mapping) for one in judges)
+    is_keyframe = any(has_moved(one, T, mapping) for one in fused)
     if is_keyframe and T_given is not None and tracking.correct_poses:
-        alignment = corrected(judges, prepared, T, tracking)
+        alignment = corrected(fused, prepared, T, tracking)
         clock.lap("track", alignment)
         if alignment is not None:
             moved, _ = displacement(T, alignment.T_reference_source)

@@ -121,9 +121,7 @@ def belonging(
     """
     tops = [top for seen in frames for top in _tops(seen, box)]
     parts = [
-        part._replace(is_doubtful=part.is_doubtful or _is_under(in_object(part.points, box), tops))
-        for i, seen in enumerate(frames)
-        for part in _parts(i, seen, box, reach, column)
+        part for i, seen in enumerate(frames) for part in _parts(i, seen, box, reach, column, tops)
     ]
     sure = [seen.points[seen.sure & points_in_box(seen.points, reach)] for seen in frames]
     background = [_background(seen, column) for seen in frames]
@@ -245,7 +243,9 @@ def _with_specks(
 # Points ------------------------------------------------------------------------------------------
 
 
-def _parts(index: int, seen: Seen, box: Box, reach: Box, column: Box) -> list[_Part]:
+def _parts(
+    index: int, seen: Seen, box: Box, reach: Box, column: Box, tops: list["_Top"]
+) -> list[_Part]:
     """The parts of a frame that lie, at least a little, within the reach of the object."""
     within = [points_in_box(seen.points, one) for one in (box, reach, column)]
     found = []
@@ -253,8 +253,9 @@ def _parts(index: int, seen: Seen, box: Box, reach: Box, column: Box) -> list[_P
         pixels = seen.labels == label
         points = seen.points[pixels]
         in_box, in_reach, in_column = (float(inside[pixels].mean()) for inside in within)
-        some, is_corner = points[:: 1 + len(points) // _SAMPLE], bool(label in seen.corners)
-        found.append(_Part(index, int(label), some, in_box, in_reach, in_column, is_corner))
+        some = points[:: 1 + len(points) // _SAMPLE]
+        is_doubtful = label in seen.corners or _is_under(in_object(some, box), tops)
+        found.append(_Part(index, int(label), some, in_box, in_reach, in_column, is_doubtful))
     return found
 
 
