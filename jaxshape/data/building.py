@@ -8,7 +8,7 @@ only the objects it was at.
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -114,6 +114,7 @@ def build_dataset(
     done: dict[int, dict[int, Record]] = {}
     for shard, items in enumerate(shards):
         if (found := _finished(folder, shard, items)) is not None:
+            _remove_parts(folder, range(starts[shard], starts[shard] + len(items)))
             progress = progress.after(len(items), *found)
             continue
         done[shard] = {}
@@ -237,6 +238,13 @@ def _write_shard(
         "notes": [(records[n].name, note) for n in numbers for note in records[n].notes],
     }
     write_json(shard_path(folder, shard, "json"), content)
+    _remove_parts(folder, numbers)
+
+
+def _remove_parts(folder: Path, numbers: Iterable[int]) -> None:
+    """Remove what a shard now holds; a build may be killed while it does so."""
+    if not (folder / "parts").is_dir():
+        return
     for number in numbers:
         for suffix in ("npz", "json"):
             _part_path(folder, number, suffix).unlink(missing_ok=True)

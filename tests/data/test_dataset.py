@@ -163,6 +163,15 @@ def test_a_shard_whose_names_are_missing_is_made_anew(objects, built, copied):
     assert (copied / "shard-00000.surface.npy").stat().st_mtime_ns == untouched.st_mtime_ns
 
 
+def test_parts_of_a_written_shard_are_removed(objects, built, copied):
+    """The kill came while the parts of the second shard were being removed."""
+    left = building._part_path(copied, OBJECTS_PER_SHARD, "json")
+    left.parent.mkdir()
+    left.write_text("[]")
+    assert [p.objects for p in build_here(copied, objects)] == [len(objects)]
+    assert contents(copied) == contents(built[0]) and not left.parent.exists()
+
+
 def test_a_repaired_file_is_made_anew(objects, copied, tmp_path):
     """A file that was empty is a box now; the other shard is left alone."""
     untouched = (copied / "shard-00001.surface.npy").stat()
