@@ -142,7 +142,7 @@ def main() -> None:
             raise SystemExit(f"{name} fails undisturbed; see {at / 'log.txt'}")
         lasted = time.monotonic() - began
         kills = given.kills // len(chosen) + (number < given.kills % len(chosen))
-        left, ends = kills, 0
+        left, ends, wrong = kills, 0, []
         while left or not ends:  # what ended between two kills begins anew
             after = draw.uniform(0.1, 0.9) * lasted if left else None
             began = time.monotonic()
@@ -151,9 +151,10 @@ def main() -> None:
                 left -= 1
                 continue
             ends, lasted = ends + 1, min(lasted, time.monotonic() - began)
-            lost += [f"exit status {status}"] if status else differences(killed, whole)
+            wrong += [f"exit status {status}"] if status else differences(killed, whole)
             shutil.rmtree(killed, ignore_errors=True) if killed.is_dir() else killed.unlink()
-        said = ", ".join(lost) or "the same result"
+        lost += wrong
+        said = ", ".join(wrong) or "the same result"
         print(f"{name}: {kills} kills, ended {ends} times with {said}", flush=True)
     sys.exit(bool(lost))
 
