@@ -202,7 +202,7 @@ def agreement(one: Moment) -> dict[str, Any]:
         "refined": np.asarray(one.shape.completed[0]),
     }
     objectives = {"encoder": one.shape.first_objective, "refined": one.shape.objective}
-    told = {
+    found = {
         name: {
             "objective": round(float(objectives[name][0]), 4),
             "explained": round(float(shape[one.occupied].mean()), 4),
@@ -214,7 +214,7 @@ def agreement(one: Moment) -> dict[str, Any]:
         "frame": one.frame,
         "measured_voxels": int(one.occupied.sum()),
         "changed_voxels": int((shapes["encoder"] != shapes["refined"]).sum()),
-        **told,
+        **found,
     }
 
 

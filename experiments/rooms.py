@@ -125,7 +125,7 @@ def one_room(number: int, frames: int, classes: SceneClasses) -> dict[str, Any]:
         "seconds": round(seconds[0], 2),
         "cpu_seconds": round(seconds[1], 2),
         "keyframes": len(scene.camera.state.keyframes),
-        "events": scene.told.events,
+        "events": scene.tracks.events,
     }  # fmt: skip
 
 
@@ -250,16 +250,16 @@ def box_overlap(a: Box, b: Box) -> float:
 
 def compared(one: Placed, found: SceneObject | None) -> dict[str, Any]:
     """An object and what was found of it."""
-    told: dict[str, Any] = {"kind": one.kind, "found": found is not None}
+    figures: dict[str, Any] = {"kind": one.kind, "found": found is not None}
     if found is None or found.decision is None:
-        return told
+        return figures
     box, decision = found.progress.start.box, found.decision
     front = one.T_world_object[:3, :3].T @ box.T_world_object[:3, 2]
     yaw = float(np.degrees(np.arctan2(front[0], front[2])))
     size = np.asarray(one.mesh.extents)
     quarters = round(yaw / 90) % 2
     own = box.size[[2, 1, 0]] if quarters else box.size
-    return told | {
+    return figures | {
         "class": decision.name,
         "sure": round(decision.sure, 3),
         "scores": decision.scores,
@@ -289,9 +289,9 @@ def mesh_iou(one: Placed, found: SceneObject) -> float:
 def summary(rooms: dict[str, Any]) -> dict[str, Any]:
     """Means over all rooms, by class; yaw errors of tables are those to the nearest half turn."""
     objects = [one for room in rooms.values() for one in room["objects"]]
-    told: dict[str, Any] = {"rooms": len(rooms), "objects": len(objects)}
-    told["false objects"] = sum(len(room["false"]) for room in rooms.values())
-    told["false objects of a class"] = sum(
+    figures: dict[str, Any] = {"rooms": len(rooms), "objects": len(objects)}
+    figures["false objects"] = sum(len(room["false"]) for room in rooms.values())
+    figures["false objects of a class"] = sum(
         one["class"] is not None for room in rooms.values() for one in room["false"]
     )
     for kind in ("chair", "table", "neither"):
@@ -301,18 +301,18 @@ def summary(rooms: dict[str, Any]) -> dict[str, Any]:
             if (one["kind"] if one["kind"] in FAMILIES else "neither") == kind
         ]
         found = [one for one in those if one["found"]]
-        told[kind] = {"objects": len(those), "found": len(found)}
+        figures[kind] = {"objects": len(those), "found": len(found)}
         for name in ("chair", "table", None):
-            told[kind][f"classed {name}"] = sum(one.get("class") == name for one in found)
+            figures[kind][f"classed {name}"] = sum(one.get("class") == name for one in found)
         right = [one for one in found if one.get("class") == (None if kind == "neither" else kind)]
         if right:
-            told[kind] |= _errors(kind, right)
-    told["seconds by objects"] = {
+            figures[kind] |= _errors(kind, right)
+    figures["seconds by objects"] = {
         str(n): round(float(np.median(those)), 1)
         for n in range(3, 7)
         if (those := [r["cpu_seconds"] for r in rooms.values() if len(r["objects"]) == n])
     }
-    return told
+    return figures
 
 
 def _errors(kind: str, right: list[dict[str, Any]]) -> dict[str, float]:

@@ -120,7 +120,7 @@ def _after(k: int, truth: trimesh.Trimesh, captured: Capture, prior: ShapePrior)
     voxels = surface(compose(F, M, logits > 0), captured.frame, smoothing=SMOOTHING)
     visible = visible_points(truth, first)
     at = fused.mesh.vertices
-    told = {
+    figures = {
         "measured to CAD": _both(at[fused.measured], truth),
         "predicted to CAD": _both(at[~fused.measured], truth),
         "seen to fused": _both(visible, fused.mesh),
@@ -130,9 +130,9 @@ def _after(k: int, truth: trimesh.Trimesh, captured: Capture, prior: ShapePrior)
     }
     if importlib.util.find_spec("open3d") is not None:
         theirs = open3d_mesh(first)
-        told["Open3D to CAD"] = _both(theirs.vertices, truth)
-        told["seen to Open3D"] = _both(visible, theirs)
-    return told
+        figures["Open3D to CAD"] = _both(theirs.vertices, truth)
+        figures["seen to Open3D"] = _both(visible, theirs)
+    return figures
 
 
 fuse = jax.jit(fuse_frames, static_argnums=1)
@@ -227,14 +227,14 @@ def claims(journal: Journal) -> list[Claim]:
         for name in ("voxels to CAD", "Open3D to CAD")
         if name in next(iter(found.values()))
     }
-    told = [f"{name} {', '.join(map(str, x.values()))} mm" for name, x in others.items()]
+    others_in_words = [f"{name} {', '.join(map(str, x.values()))} mm" for name, x in others.items()]
     better = [all(ours[k] <= 1.1 * x[k] for k in ours) for x in others.values()]
     return [
         Claim(
             "Fig. real_cma_au",
             "The measured surface is as exact as the sensor allows",
             f"Measured to CAD {', '.join(map(str, ours.values()))} mm after "
-            f"{', '.join(ours)} frames; " + "; ".join(told),
+            f"{', '.join(ours)} frames; " + "; ".join(others_in_words),
             "yes" if all(better) else "partly" if any(better) else "no",
         )
     ]

@@ -66,8 +66,8 @@ def run(arguments: Sequence[str], output: Path, after: float | None, log: Path) 
     """Run a command, killed after some seconds; its exit status."""
     argv = [sys.executable, "-m", "jaxshape.cli", *arguments, "--output", str(output)]
     with (
-        open(log, "ab") as told,
-        subprocess.Popen(argv, stdout=told, stderr=told, start_new_session=True) as process,
+        open(log, "ab") as log_file,
+        subprocess.Popen(argv, stdout=log_file, stderr=log_file, start_new_session=True) as process,
     ):
         try:
             return process.wait(after)

@@ -136,10 +136,10 @@ def write_shape_mesh(
         (folder / "trace.npz").unlink(missing_ok=True)  # of an earlier search
     else:
         write_trace(folder / "trace.npz", jax.tree.map(lambda x: x[: one.iterations], one.trace))
-    told = {**figures, **_searched(one), **_of_mesh(found), **_measured(observation, one)}
+    figures = {**figures, **_searched(one), **_of_mesh(found), **_measured(observation, one)}
     if observation.keyframes or observation.cloud is not None:
-        told |= _judged(observation, found, bool(one.symmetric))
-    return told, found
+        figures |= _judged(observation, found, bool(one.symmetric))
+    return figures, found
 
 
 class ShapeMesh(NamedTuple):

@@ -113,7 +113,7 @@ def write_scene_progress(
         for one in scene.objects
     ]
     result = figures | counts(scene.camera) | {"running": True, "objects": entries}
-    write_json(folder / "scene.json", result | {"events": list(scene.told.events)})
+    write_json(folder / "scene.json", result | {"events": list(scene.tracks.events)})
 
 
 def _measured_mesh(one: SceneObject) -> trimesh.Trimesh | None:
@@ -227,17 +227,17 @@ def scene_entries(
         figures: Further entries.
         warnings: Further warnings, in sentences.
     """
-    moved = [one.number for one in scene.told.things if one.is_moved]
+    moved = [one.number for one in scene.tracks.things if one.is_moved]
     named = [f"{one.one.name}: {text}" for one in written for text in one.result["warnings"]]
-    told = [*figures.get("warnings", ()), *unreadable(scene.camera), *scene_warnings(scene)]
+    warned = [*figures.get("warnings", ()), *unreadable(scene.camera), *scene_warnings(scene)]
     return {
         **figures,
         **counts(scene.camera),
         "keyframes": len(scene.camera.state.keyframes),
-        "warnings": [*told, *warnings, *named],
+        "warnings": [*warned, *warnings, *named],
         "objects": [_entry(one) for one in written],
         "moved": moved,
-        "events": list(scene.told.events),
+        "events": list(scene.tracks.events),
     }
 
 
@@ -252,7 +252,7 @@ def scene_warnings(scene: Scene) -> list[str]:
         found.append("No floor was seen, and without it no objects: film the floor, too.")
     elif not scene.objects:
         found.append("Nothing of the size of an object stands on the floor or on a table.")
-    for one in scene.told.things:
+    for one in scene.tracks.things:
         if one.is_moved:
             found.append(f"Something was moved while it was filmed, and left out: {one.number}.")
     return found

@@ -281,9 +281,9 @@ def _result(content: bytes, folder: Path) -> object:
         _written(seed, folder, RESULTS)
     _written(content, folder, RESULTS)
     found = read_folder(folder)
-    told = [*headline(found), *warnings_of(found), *map(tracked, found.keyframes)]
+    said = [*headline(found), *warnings_of(found), *map(tracked, found.keyframes)]
     placed = camera_poses(found), extent(found), half_field_of_view(found)
-    return told, placed, read_search(folder)
+    return said, placed, read_search(folder)
 
 
 def _results() -> list[bytes]:

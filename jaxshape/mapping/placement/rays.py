@@ -21,8 +21,8 @@ REACH = 1.2
 """Radius of the ball around the object in which rays count, in typical extents."""
 
 FREE_GAP = 0.06
-"""The end of a ray in front of what it met that does not count as free, in typical extents: noise,
-and the thickness of a voxel."""
+"""Length of the last stretch of a ray before its hit that does not count as free space, in typical
+extents. It covers noise and the thickness of a voxel."""
 
 
 class RaySamples(NamedTuple):

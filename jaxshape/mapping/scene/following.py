@@ -29,7 +29,7 @@ from jaxshape.mapping.placement.finding import Start, first_readable, room
 from jaxshape.mapping.scene.boxing import boxed, fits, placed, turned_box
 from jaxshape.mapping.scene.classes import Decision, SceneClasses, decide, unfilled
 from jaxshape.mapping.scene.look import Look, look_around, scene_parts, shown
-from jaxshape.mapping.scene.things import Thing, Told
+from jaxshape.mapping.scene.things import Thing, Tracks
 from jaxshape.mapping.scene.world import Level
 from jaxshape.mapping.tracking.keyframes import Cut, PreparedFrame, as_pose, prepare
 
@@ -70,13 +70,13 @@ class Scene(NamedTuple):
         camera: What carries the camera: the map of no object, with all keyframes.
         objects: The objects, in the order of their numbers.
         level: The level frame; None before a floor was seen.
-        told: What appeared, was joined, parted and moved.
+        tracks: The tracked objects: which appeared, were joined, parted and moved.
     """
 
     camera: Progress
     objects: tuple[SceneObject, ...]
     level: Level | None
-    told: Told
+    tracks: Tracks
 
     @property
     def logs(self) -> tuple[FrameLog, ...]:
@@ -128,8 +128,8 @@ def _begin(
     )
     start = Start(index, None, None, state.place.box, T, None, np.nan, None, (), ())
     log = FrameLog(index, frame.name, "keyframe", "", 0, np.eye(4), as_figures(step))
-    scene = Scene(Progress(state, start, (log,)), (), None, Told())
-    return index, _with_look(scene, look_around(state.keyframes, None, None, Told()), classes)
+    scene = Scene(Progress(state, start, (log,)), (), None, Tracks())
+    return index, _with_look(scene, look_around(state.keyframes, None, None, Tracks()), classes)
 
 
 def _next(
@@ -157,7 +157,7 @@ def _recut(scene: Scene, looks: list[Look], prepared: PreparedFrame, progress: P
     def cut(T: jaxlie.SE3):
         if not looks:
             keyframes = scene.camera.state.keyframes
-            looks.append(look_around(keyframes, (prepared, T), scene.level, scene.told))
+            looks.append(look_around(keyframes, (prepared, T), scene.level, scene.tracks))
         return looks[0].new.parts, jnp.asarray(looks[0].pixels(number))
 
     return cut
@@ -175,9 +175,9 @@ def _parts(one: SceneObject, classes: SceneClasses) -> Parts:
 def _with_look(scene: Scene, look: Look, classes: SceneClasses) -> Scene:
     """The scene with its objects as a look around found them."""
     known = {one.thing.number: one for one in scene.objects}
-    scene = scene._replace(level=look.level, told=look.told)
+    scene = scene._replace(level=look.level, tracks=look.tracks)
     changed, objects = [], []
-    for thing in sorted(look.told.things, key=lambda one: one.number):
+    for thing in sorted(look.tracks.things, key=lambda one: one.number):
         if thing.is_moved:
             continue
         before = known.get(thing.number)

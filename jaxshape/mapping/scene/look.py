@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from jaxshape.mapping.map.cutting import parts_in
 from jaxshape.mapping.placement.faces import Cutout, world_points
 from jaxshape.mapping.placement.finding import rotation_onto_y
-from jaxshape.mapping.scene.things import Thing, Told, told_apart
+from jaxshape.mapping.scene.things import Thing, Tracks, associate
 from jaxshape.mapping.scene.world import (
     CELL,
     CHANGED,
@@ -47,12 +47,12 @@ class Look(NamedTuple):
     Attributes:
         new: The new keyframe.
         level: The level frame; None before a floor was seen.
-        told: The objects.
+        tracks: The tracked objects.
     """
 
     new: Shown
     level: Level | None
-    told: Told
+    tracks: Tracks
 
     def pixels(self, number: int) -> Bool[np.ndarray, "h w"]:
         """The pixels of the new keyframe that show an object.
@@ -60,7 +60,7 @@ class Look(NamedTuple):
         Args:
             number: Number of the object; none has the number 0.
         """
-        thing = next((one for one in self.told.things if one.number == number), None)
+        thing = next((one for one in self.tracks.things if one.number == number), None)
         if thing is None:
             return np.zeros(np.shape(self.new.view.depth), bool)
         return self.pixels_in(thing, self.new)
@@ -91,7 +91,7 @@ def look_around(
     keyframes: Sequence[Keyframe],
     new: tuple[PreparedFrame, jaxlie.SE3] | None,
     level: Level | None,
-    told: Told,
+    tracks: Tracks,
 ) -> Look:
     """What all keyframes show, and which objects that are.
 
@@ -99,7 +99,7 @@ def look_around(
         keyframes: The keyframes so far, with their parts.
         new: One more, and its pose; None to look at those alone.
         level: The level frame, if it is known.
-        told: The objects so far.
+        tracks: The tracked objects so far.
     """
     views = shown(keyframes)
     if new is not None:
@@ -109,8 +109,8 @@ def look_around(
         views = [*views, Shown(view, parts)]
     level = level or _level(views[-1])
     if level is not None:
-        told = _told(views, level, told)
-    return Look(views[-1], level, told)
+        tracks = _associated(views, level, tracks)
+    return Look(views[-1], level, tracks)
 
 
 def scene_parts(prepared: PreparedFrame) -> Parts:
@@ -140,18 +140,18 @@ def shown(keyframes: Sequence[Keyframe]) -> list[Shown]:
     return found
 
 
-def _told(views: Sequence[Shown], level: Level, told: Told) -> Told:
+def _associated(views: Sequence[Shown], level: Level, tracks: Tracks) -> Tracks:
     """The objects: those that masks number, or else the clusters of the room."""
     if not any(one.parts.are_numbered for one in views):
         cells = cells_of([one.view for one in views], level)
-        return told_apart(told, clusters_of(cells, level))
+        return associate(tracks, clusters_of(cells, level))
     cells = cells_of([one.view for one in views], level)
     changed = keys_of(cells.index[cells.is_changed])
     found = [_numbered(n, views, level, changed) for n in _numbers(views)]
     things = tuple(one for one in found if len(one.keys) >= LEAST_CELLS)
-    known = {one.number for one in told.things}
+    known = {one.number for one in tracks.things}
     events = [f"Object {one.number} appeared." for one in things if one.number not in known]
-    return Told(things, (*told.events, *events), max((one.number for one in things), default=0))
+    return Tracks(things, (*tracks.events, *events), max((one.number for one in things), default=0))
 
 
 def _numbers(views: Sequence[Shown]) -> list[int]:

@@ -35,8 +35,8 @@ class Thing(NamedTuple):
     is_numbered: bool = False
 
 
-class Told(NamedTuple):
-    """The objects of a scene, and what became of them.
+class Tracks(NamedTuple):
+    """The objects that are tracked in a scene, and what became of them.
 
     Attributes:
         things: The objects.
@@ -49,8 +49,8 @@ class Told(NamedTuple):
     numbers: int = 0
 
 
-def told_apart(before: Told, clusters: Sequence[Cluster]) -> Told:
-    """The objects of a scene once more of it was seen.
+def associate(before: Tracks, clusters: Sequence[Cluster]) -> Tracks:
+    """The tracked objects once more of the scene was seen: data association.
 
     An object is the cluster with which it shares most cells. Of two objects in one cluster the
     larger one stays; of two clusters of one object the larger one is that object. What is left over
@@ -90,7 +90,7 @@ def told_apart(before: Told, clusters: Sequence[Cluster]) -> Told:
     for i, one in enumerate(before.things):
         if i not in same.values():
             events.append(_vanished(one, shared[i], number_of))
-    return Told(tuple(things), (*before.events, *events), numbers)
+    return Tracks(tuple(things), (*before.events, *events), numbers)
 
 
 def _matched(
@@ -106,7 +106,7 @@ def _matched(
     return found
 
 
-def _appeared(number: int, shared: Int[np.ndarray, " thing"], before: Told, size: int) -> str:
+def _appeared(number: int, shared: Int[np.ndarray, " thing"], before: Tracks, size: int) -> str:
     if len(shared) and shared.max() > SAME * size:
         return f"Object {number} parted from object {before.things[int(shared.argmax())].number}."
     return f"Object {number} appeared."

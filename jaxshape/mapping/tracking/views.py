@@ -54,8 +54,8 @@ def halved(
 ) -> tuple[Float[Array, "h//2 w//2"], Intrinsics]:
     """A depth image of half the size, and its camera.
 
-    A pixel is the mean of those, of four, that lie on the nearest surface; of a block where nothing
-    was measured it is infinite if most of its rays met nothing, else 0, unknown.
+    A new pixel is the mean of the pixels in its 2 x 2 block that lie on the nearest surface. Where
+    nothing in a block was measured, it is infinite if most rays met nothing, else 0 (unknown).
     """
     h, w = depth.shape
     blocks = depth[: h // 2 * 2, : w // 2 * 2].reshape(h // 2, 2, w // 2, 2)

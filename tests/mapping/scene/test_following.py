@@ -134,7 +134,7 @@ def test_an_object_that_is_moved_is_left_out(tmp_path, classes):
     shown = [(CHAIR, CRATE)] * 2 + [(CHAIR,)] * 3
     *_, scene = follow_scene(record(tmp_path / "moved", *shown), classes, use_poses=True)
     assert len(scene.objects) == 1
-    assert any("moved" in event for event in scene.told.events)
+    assert any("moved" in event for event in scene.tracks.events)
 
 
 def test_an_empty_room_is_followed_to_its_end(tmp_path, classes):

@@ -7,7 +7,7 @@ from analytic_room import CHAIR, CRATE, FLOOR, TABLE, WALLS, K, room
 from jaxshape.geometry.camera import intrinsics_of
 from jaxshape.mapping.placement.faces import Cutout
 from jaxshape.mapping.scene.boxing import boxed, turned_box
-from jaxshape.mapping.scene.things import Told, told_apart
+from jaxshape.mapping.scene.things import Tracks, associate
 from jaxshape.mapping.scene.world import CELL, Level, cells_of, clusters_of, rectangle
 from jaxshape.mapping.segmentation.parts import parts_of
 
@@ -88,7 +88,7 @@ def test_the_smallest_rectangle_is_turned_as_its_points_are():
 
 
 def test_a_box_is_around_all_cells_and_stands_on_the_floor(furnished):
-    for thing in told_apart(Told(), furnished).things:
+    for thing in associate(Tracks(), furnished).things:
         box = boxed(thing, LEVEL)
         p = ((thing.index + 0.5) * CELL - box.T_world_object[:3, 3]) @ box.T_world_object[:3, :3]
         assert (np.abs(p) <= box.size / 2 + CELL).mean() > 0.98
@@ -96,7 +96,7 @@ def test_a_box_is_around_all_cells_and_stands_on_the_floor(furnished):
 
 
 def test_a_box_turned_four_times_is_the_same():
-    thing = told_apart(Told(), found(seen(CHAIR)))[0][0]
+    thing = associate(Tracks(), found(seen(CHAIR)))[0][0]
     box = boxed(thing, LEVEL)
     again = box
     for _ in range(4):
