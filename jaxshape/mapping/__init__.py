@@ -1,11 +1,11 @@
 """From an RGB-D recording to the object in it: segmentation, tracking, placement and the map.
 
-Five rooms, in the order of the imports, which run one way:
+The modules, in the order of their imports, which run one way:
 
     config         settings of tracking and mapping
     segmentation   which pixels of a depth frame show the object
     tracking       the pose of a frame, and what a keyframe keeps of it
     placement      where the object stands, how it is turned and how large it is
     map            keyframes, fused and realigned with the shapes that explain them
-    scene          several objects of several classes, found, told apart and decided
+    scene          several objects of several classes: detected, tracked and classified
 """

@@ -27,8 +27,8 @@ class TrackingConfig:
             above 0.
         max_distance: Distance from the expected pose beyond which a pose is not believed, in
             metres, above 0.
-        correct_poses: Move keyframes whose poses are given, by little, to where they agree better
-            with the map: given poses drift, too. False takes all given poses as they are.
+        correct_poses: Move keyframes with given poses slightly, to where they agree better with
+            the map: given poses drift, too. False takes all given poses as they are.
 
     Raises:
         ValueError: A setting is outside its range.
@@ -66,7 +66,7 @@ class MappingConfig:
         isotropic: Scale all axes of the grid alike, as the paper does on real data, instead of
             filling the box.
         fusion: How keyframes are fused: `distance` averages signed distances on a fine grid, which
-            takes the noise of depth away; `points` counts measured points in voxels (paper).
+            removes depth noise; `points` counts measured points in voxels (paper).
         depth_noise: Standard deviation of the camera's depth, above 0, in metres at 1 m; it grows
             with the square of depth. The default is that of the first Kinect. For `distance`.
         min_hits: For `points`: depth points that make a voxel occupied, 1 or more (paper: 1). More

@@ -1,8 +1,8 @@
 """The object's pixels in the keyframes of a map, decided together. [host]
 
 cut_new       the pixels of a new frame
-cut_all       those of all keyframes, after its box has changed
-is_outgrown   whether more belongs to the object than its box holds
+cut_all       the object's pixels in all keyframes, after its box has changed
+is_outgrown   whether parts of the object lie outside of its box
 """
 
 import jax.numpy as jnp
@@ -23,13 +23,13 @@ from jaxshape.mapping.segmentation.parts import Parts, parts_of
 from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame, resized
 
 RECENT = 8
-"""Keyframes, besides the first, that a new one is compared with."""
+"""Number of latest keyframes that a new keyframe is compared with, besides the first keyframe."""
 
 OUTSIDE = 0.01
-"""Share of the object's points outside of its box from which that is too small."""
+"""Share of the object's points outside of its box above which the box is too small."""
 
 FURTHER = 0.03
-"""Metres outside of the box from which points count: noise goes that far."""
+"""Distance from the box, in metres, beyond which points are outside: noise reaches that far."""
 
 
 def parts_in(
@@ -82,7 +82,7 @@ def cut_all(keyframes: tuple[Keyframe, ...], box: Box) -> tuple[Keyframe, ...]:
         box: The box that the object is cut out with.
 
     Returns:
-        The keyframes; those whose object was given by a mask are as they were.
+        The keyframes; those in which a mask gave the object are unchanged.
     """
     found = belonging(_all_seen(keyframes), box, *reach_of(box))
     return tuple(
@@ -92,7 +92,7 @@ def cut_all(keyframes: tuple[Keyframe, ...], box: Box) -> tuple[Keyframe, ...]:
 
 
 def is_outgrown(box: Box, keyframes: tuple[Keyframe, ...]) -> bool:
-    """Whether more was measured of the object, outside of its box, than noise.
+    """Whether more points of the object lie outside of its box than noise explains.
 
     Args:
         box: The object's box.
@@ -108,7 +108,7 @@ def _all_seen(keyframes: tuple[Keyframe, ...]) -> list[Seen]:
 
 
 def _seen(view: Cutout, parts: Parts | None) -> Seen:
-    """A frame in the world; where the box alone tells the object, all of it is known."""
+    """A frame in the world; without parts, all of its segmented pixels surely show the object."""
     segmented = np.asarray(view.segmented)
     if parts is None:
         return Seen(world_points(view), np.zeros(segmented.shape, int), segmented)

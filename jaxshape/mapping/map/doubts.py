@@ -17,23 +17,25 @@ from jaxshape.mapping.placement.faces import (
 from jaxshape.mapping.placement.finding import Start
 
 LEGS = 0.15
-"""Share of the height of the box, from below, that legs take up at least."""
+"""Least share of the height of the box, from the bottom, that legs take up."""
 
 LEFT_OUT = 0.15
-"""Share of what the first frame showed as the object from which its absence in the map is said."""
+"""Share of the object's pixels in the first frame that are missing in the map, from which a warning
+is given."""
 
 MOVED = 0.01
-"""Metres by which a given pose was moved from which that is said."""
+"""Distance by which a given pose was moved, in metres, from which a warning is given."""
 
-_LOWEST = 0.5  # percent of the points that may lie below what counts as measured
+_LOWEST = 0.5  # percent of the points that may lie below the lowest measured height
 
 
 class Unseen(NamedTuple):
-    """What no keyframe saw of the object.
+    """Parts of the object that no keyframe saw.
 
     Attributes:
-        faces: Names of the faces of its box at which it was not seen to end.
-        below: Share of its height, from below, of which nothing was measured, from 0 to 1.
+        faces: Names of the faces of its box where no keyframe saw the object end.
+        below: Share of the height of its box, from the bottom, in which nothing was measured, from
+            0 to 1.
     """
 
     faces: tuple[str, ...] = ()
@@ -41,12 +43,12 @@ class Unseen(NamedTuple):
 
 
 ALL_SEEN = Unseen()
-"""Nothing that is known to be unseen, as where a user gave the box."""
+"""No part is known to be unseen, for example where a user gave the box."""
 
 
 def doubts_of(progress: Progress) -> tuple[str, ...]:
-    """Warnings of frames that cannot be read, of given poses that were moved, of keyframes without
-    the object, of what its box left out, and of what was not seen of its box and its legs.
+    """Warnings about unreadable frames, moved poses, keyframes without the object, pixels of the
+    object outside of its box, and unseen faces and legs.
 
     Args:
         progress: Progress of a recording.
@@ -75,7 +77,7 @@ def _moved(progress: Progress) -> tuple[str, ...]:
 
 
 def unseen_in_words(progress: Progress) -> tuple[str, ...]:
-    """Warnings of what was not seen of the object: of its box and of its legs.
+    """Warnings about unseen faces of the object's box and about unseen legs.
 
     Args:
         progress: Progress of a recording.
@@ -85,13 +87,13 @@ def unseen_in_words(progress: Progress) -> tuple[str, ...]:
 
 
 def unseen_of(progress: Progress) -> Unseen:
-    """What no keyframe saw of the object.
+    """Find the parts of the object that no keyframe saw.
 
     Args:
         progress: Progress of a recording.
 
     Returns:
-        The faces of its box and the share of its height; nothing where the box was given.
+        The unseen faces and the unseen share of the height; nothing where the box was given.
     """
     if progress.start.T_level_world is None:
         return ALL_SEEN
@@ -128,7 +130,7 @@ def _empty(progress: Progress) -> tuple[str, ...]:
 
 
 def _left_out(progress: Progress) -> tuple[str, ...]:
-    """Whether much that was chosen in the first frame is not the object of the map."""
+    """A warning if many pixels that were chosen in the first frame are not the map's object."""
     first = progress.state.keyframes[0]
     if progress.start.T_level_world is None or first.parts is None or not first.parts.sure.any():
         return ()
@@ -154,7 +156,7 @@ def _faces(start: Start, views: list[Cutout]) -> tuple[str, ...]:
 
 
 def _below(box: Box, views: list[Cutout]) -> float:
-    """Share of the height of the box below all that was measured; 0 where nothing was."""
+    """Share of the box height below the lowest measured point; 0 where nothing was measured."""
     points = in_object(object_points(views), box)
     if not len(points):
         return 0.0
@@ -181,7 +183,7 @@ def joined(names: Sequence[str]) -> str:
 
 
 def _of_legs(unseen: Unseen, height: float) -> tuple[str, ...]:
-    """Whether everything near the floor is predicted."""
+    """A warning if everything near the floor is predicted."""
     if unseen.below < LEGS:
         return ()
     return (

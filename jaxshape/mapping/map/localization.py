@@ -2,7 +2,7 @@
 
 localize    registration from the expected pose; where that fails, from many others
 corrected   registration from a given pose, where the frame then agrees better
-has_moved   whether a frame shows the object from elsewhere than the last keyframe
+has_moved   whether a frame shows the object from another viewpoint than the last keyframe
 """
 
 from collections.abc import Sequence
@@ -23,29 +23,29 @@ from jaxshape.mapping.tracking.surfels import Surface
 from jaxshape.mapping.tracking.views import DepthView
 
 BETTER = 0.01
-"""Share of the points, of those expected to be seen again, that more must agree for a given pose to
-be moved."""
+"""Least increase of the inlier fraction, among the points expected to be seen again, for which a
+given pose is moved."""
 
 NEARBY = (0.15, 6.0)
-"""Metres and degrees by which a given pose is moved at most."""
+"""Largest distance in metres, and largest angle in degrees, by which a given pose is moved."""
 
-_JUMP = (0.5, 15.0)  # metres and degrees: what tracking bridges without a guess of the motion
+_JUMP = (0.5, 15.0)  # metres and degrees: tracking needs no predicted motion below these
 
 
 def localize(
     states: Sequence[MapState], prepared: PreparedFrame, config: TrackingConfig
 ) -> tuple[Alignment, str | None]:
-    """The pose of a frame in the world, and a reason against it.
+    """The pose of a frame in the world, and the reason to reject it, if there is one.
 
     Args:
-        states: Maps of one or more objects with the same keyframes; the frame is expected where the
-            motion of the last frames goes on.
+        states: Maps of one or more objects with the same keyframes; the expected pose continues
+            the motion of the last frames.
         prepared: The frame.
         config: Settings of tracking.
 
     Returns:
-        The alignment of the frame with the map; and a few words against it, None where there are
-        none.
+        The alignment of the frame with the map; and the reason to reject it in a few words, None
+        where it is accepted.
     """
     state = states[0]
     T_expected = (state.T_world_camera @ state.T_before_last).normalize()
@@ -78,7 +78,7 @@ def corrected(
         config: Settings of tracking.
 
     Returns:
-        None where the frame agrees no better elsewhere, or where nothing is sure.
+        The alignment; None where no nearby pose agrees better, or where the alignment is unsure.
     """
     state = states[0]
     pixels = _tracked_pixels(states, prepared, T_world_camera, config)
@@ -95,7 +95,7 @@ def corrected(
 
 
 def _surfaces(states: Sequence[MapState], config: TrackingConfig) -> tuple[Surface, ...]:
-    """The surfaces that a frame is aligned with, a power of two of them: some may be empty."""
+    """The surfaces that a frame is aligned with, filled up to a power of two with empty ones."""
     nothing = no_surface(states[0].place.lattice)
     if config.against == "keyframe":
         return (nothing,)
@@ -126,7 +126,7 @@ def _relocalized(
 ) -> tuple[Alignment, bool]:
     """The best alignment from many guesses about the object, and whether it is believed.
 
-    Against the last keyframe, then against others; however far the camera jumped.
+    The last keyframe is tried first, then others. The camera may have jumped any distance.
     """
     center = jnp.float32(state.place.box.T_world_object[:3, 3])
     best = found
@@ -178,15 +178,15 @@ def _register_from(view, pixels, reference, T_reference, surfaces, T_near, cente
 
 
 def moved_to(state: MapState, T_world_camera: jaxlie.SE3) -> MapState:
-    """The state after a frame was found at a pose: the next one is expected further on.
+    """The state after a frame was found at a pose, with the motion expected for the next frame.
 
     Args:
         state: The map before the frame.
         T_world_camera: The pose of the frame.
 
     Returns:
-        The same map, with the pose and the motion to it. After a jump, as over missing frames, no
-        motion is expected.
+        The same map, with the pose and the motion to it. After a jump, for example over missing
+        frames, no motion is expected.
     """
     motion = (state.T_world_camera.inverse() @ T_world_camera).normalize()
     distance, angle = displacement(motion, jaxlie.SE3.identity())
@@ -198,7 +198,7 @@ def moved_to(state: MapState, T_world_camera: jaxlie.SE3) -> MapState:
 
 
 def has_moved(state: MapState, T_world_camera: jaxlie.SE3, config: MappingConfig) -> bool:
-    """Whether a frame shows the object from elsewhere than the last keyframe.
+    """Whether a frame shows the object from another viewpoint than the last keyframe.
 
     Args:
         state: The map.
@@ -206,7 +206,8 @@ def has_moved(state: MapState, T_world_camera: jaxlie.SE3, config: MappingConfig
         config: Settings of mapping, with the distance and angle between keyframes.
 
     Returns:
-        True where it turned, as it is or as seen from the object, or moved further than that.
+        True where the camera turned, about itself or about the object, by more than this angle, or
+        moved by more than this distance.
     """
     T_last = state.keyframes[-1].T_world_camera
     distance, turned = displacement(T_last, T_world_camera)

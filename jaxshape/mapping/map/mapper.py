@@ -7,11 +7,11 @@
     state, shape = mapper.finish(state)
 
 `init` makes the first keyframe. `step` tracks a frame, against the last keyframe and against the
-map's surface, and drops it where its pose is in doubt. Where it has moved enough it becomes a
-keyframe: it is fused into F, M and the surface, the code is searched on from the better of the
-encoder's proposal and the code found so far, and all keyframes are realigned with the new shape,
-after which everything is fused anew. No function changes what it is given; a keyframe costs a fixed
-amount of memory, its depth image and one cloud. [host, around jitted parts]
+map's surface, and drops it where its pose is in doubt. A frame that has moved enough becomes a
+keyframe: it is fused into F, M and the surface, the search of the code goes on from the better of
+the encoder's proposal and the code found so far, all keyframes are realigned with the new shape,
+and everything is fused anew. No function changes its arguments; a keyframe costs a fixed amount of
+memory, its depth image and one cloud. [host, around jitted parts]
 """
 
 from collections.abc import Callable, Sequence
@@ -55,10 +55,10 @@ class Mapper(NamedTuple):
             pose is given, and map it if it has moved enough. `cut(T_world_camera)` gives the parts
             of a new keyframe and the pixels that show the object, once its pose is known.
         moved: `(state, box, *, room=0.0, segmented=None) -> state, shape`: the same keyframes,
-            mapped in another box, with other pixels of each taken for the object.
+            mapped in another box and with other pixels of the object.
         finish: `state -> state, shape`: realign once more, and search as long as the settings
             allow.
-        parts: What these functions share, for a scene that maps several objects together.
+        parts: Data shared by these functions, for a scene that maps several objects together.
     """
 
     init: Callable[..., tuple[MapState, Step]]
@@ -95,7 +95,7 @@ def build_mapper(
     Returns:
         The four functions over the state of a map.
     """
-    # Without a search the long one is the short one, which is then compiled once.
+    # Without a refiner, short and long search are the same function, which is compiled once.
     short = search.iterations if refiner is None else mapping.keyframe_iterations
     parts = Parts(
         prior,
@@ -154,7 +154,7 @@ def _step(
 
 
 def _refined(parts: Parts, state: MapState) -> tuple[MapState, Reconstruction | None]:
-    """The shape of what is fused so far, searched on from the one before."""
+    """The shape that explains all fused keyframes, searched from the previous shape."""
     (state,), (shape,) = refine_all([Member(parts, state)])
     return state, shape
 
@@ -186,7 +186,7 @@ def placed_in(
         state: The map.
         box: The box.
         room: Share by which the box that cuts out the object is larger.
-        segmented: The object's pixels in each keyframe; None for those in its box.
+        segmented: The object's pixels in each keyframe; None for all pixels in its box.
     """
     pixels = segmented or [None] * len(state.keyframes)
     place = place_of(box, parts.prior.resolution, room, isotropic=parts.mapping.isotropic)

@@ -3,10 +3,10 @@
 The sums go over all objects of the map, each with a grid of its own.
 
 In every cell of the map's grid, the patches that the keyframes see there should lie on one plane.
-Where that plane lies is eliminated, so that the unknowns are the poses alone: moving one keyframe
-moves what the others are compared with, and a loop closes in a few steps instead of being carried
-round keyframe by keyframe. The refined shape takes part as one more observer of each cell, which
-does not move. Poses relative to the previous keyframe, as tracking found them, are one more term.
+The position of that plane is eliminated, so that the unknowns are the poses alone: moving one
+keyframe also moves the planes that the others are compared with, so a loop closes in a few steps
+instead of spreading keyframe by keyframe. The refined shape takes part as one more observer of each
+cell, which does not move. The tracked poses relative to the previous keyframe are one more term.
 
     minimise over T   sum_ck rho(n_c . (T_k p_ck - m_c))  +  sum_k |log(T_(k-1)^-1 T_k E_k^-1)|^2
 
@@ -26,16 +26,16 @@ from jaxshape.mapping.tracking.icp import Cloud, robust_weight
 from jaxshape.mapping.tracking.surfels import CELLS, FLAT, Lattice, Surface, cell_of
 
 OCCUPIED_CELLS = 12288
-"""Cells that take part at most."""
+"""Largest number of cells that take part."""
 
 CORRELATION = 1 / 200
-"""Share of the points behind a tracked pose that count as independent: neighbours have their errors
-in common."""
+"""Share of the points behind a tracked pose that count as independent: errors of neighbouring
+points are correlated."""
 
 SHAPE_CORRELATION = 1 / 1000
-"""Share of the patches of the refined shape that count as independent: it errs by whole parts."""
+"""Share of the patches of the refined shape that count as independent: whole parts err together."""
 
-_PATCH_DEVIATION = 0.002  # metres: of a keyframe's mean in a cell, however many points it has
+_PATCH_DEVIATION = 0.002  # metres: least deviation of a keyframe's mean in a cell
 _ITERATIONS = 8
 _ROUGH = 0.01  # metres added to the deviations at first; halved in each step
 _PARALLEL = 0.8  # least cosine between the normals of a cell and of the refined shape
@@ -83,16 +83,16 @@ def realign(
     Args:
         clouds: Oriented points that each keyframe shows of each object `[object k ...]`, in its
             camera's frame, padded to one number.
-        T_world_camera: Poses of the keyframes before `[k]`.
+        T_world_camera: Poses of the keyframes before the realignment `[k]`.
         is_keyframe: False for padding `[k]`.
         lattice: Cells of each object `[object ...]`, in which keyframes are compared.
         predicted: Surface of the refined shape of each object `[object ...]`.
         odometry: Tracked poses between neighbouring keyframes.
-        is_fixed: True for keyframes that keep their poses `[k]`; without one, the whole map may
-            drift.
+        is_fixed: True for keyframes that keep their poses `[k]`; if there is none, the whole map
+            may drift.
 
     Returns:
-        Poses of the keyframes after `[k]`.
+        Poses of the keyframes after the realignment `[k]`.
     """
     moves = is_keyframe & ~is_fixed
 
@@ -193,8 +193,8 @@ def _heights_of_shape(predicted: Surface, middle, normal, tolerance):
 
 
 def _odometry_equations(T: jaxlie.SE3, odometry: Odometry):
-    """Moving a keyframe and the one before it alike changes nothing; so in the world frame, the
-    blocks of both are the information of their relative pose, with either sign."""
+    """A common motion of a keyframe and the previous one changes nothing. So in the world frame,
+    the blocks of both are the information of their relative pose, with plus or minus sign."""
     k = T.wxyz_xyz.shape[0]
     now, before = jnp.arange(k), jnp.maximum(jnp.arange(k) - 1, 0)
     T_before = jax.tree.map(lambda x: x[before], T)

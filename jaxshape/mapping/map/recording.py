@@ -5,7 +5,7 @@
         ...                              # after every frame; write, draw, or stop and go on later
     state, reconstruction = mapper.finish(progress.state)
 
-Whatever is wrong with one frame, a damaged file or a pose in doubt, costs that frame alone and is
+An error in one frame, such as a damaged file or a pose in doubt, costs that frame alone and is
 written down in its `FrameLog`.
 """
 
@@ -37,8 +37,8 @@ PLACE_AGAIN = (2, 3, 5, 9)
 """Numbers of keyframes after which the object is placed anew."""
 
 REVISIONS, CHANGED = 2, 0.02
-"""Times that the object is placed anew after one keyframe, and the share of its pixels that have to
-become others or be no more the object for another time."""
+"""Largest number of placements after one keyframe, and the share of the object's pixels that must
+change for a second placement."""
 
 
 class FrameLog(NamedTuple):
@@ -148,7 +148,7 @@ class Followed(NamedTuple):
     """An object that is followed with others.
 
     Attributes:
-        progress: Its map and its place; its logs are those of all.
+        progress: Its map and its place; all objects share the same logs.
         parts: Prior and settings of its class.
         is_fused: Whether new keyframes are fused into it.
     """
@@ -159,7 +159,8 @@ class Followed(NamedTuple):
 
 
 Recut = Callable[[PreparedFrame, Progress], Cut | None]
-"""From a new frame and the progress of an object to what cuts the object out of the frame."""
+"""Takes a new frame and the progress of an object; returns the function that cuts the object out of
+the frame."""
 
 
 def advance(
@@ -220,9 +221,9 @@ def _log(index: int, name: str, state: MapState, step: Step) -> FrameLog:
 
 
 def _belonging(prepared: PreparedFrame, progress: Progress) -> Cut | None:
-    """How one object alone is cut out: by its box, and by the parts that belong to it.
+    """How a single object is cut out: by its box, and by the parts that belong to it.
 
-    A mask, or a box that was given, says what is the object; a box that was found is not sure.
+    A mask or a given box defines the object; a box that was found is uncertain.
     """
     is_masked = not np.asarray(prepared.masked).all()
     if progress.start.T_level_world is None or is_masked:
@@ -248,9 +249,9 @@ def as_figures(step: Step) -> dict[str, float]:
 def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progress:
     """The progress with the object's box estimated again, where that is due.
 
-    It is due after some keyframes, and where one shows the floor, or more of the object than the
-    box holds. With another box other pixels may be the object, so that it is placed again. After
-    the other keyframes the box is fitted to the faces that they show.
+    It is due after certain keyframes, and when a keyframe shows the floor or parts of the object
+    outside of the box. A new box may change the object's pixels, and then the object is placed
+    again. After all other keyframes the box is only fitted to the faces that were seen.
     """
     if progress.start.T_level_world is None:
         return progress
@@ -270,7 +271,7 @@ def _placed_anew(progress: Progress, mapper: Mapper, prior: ShapePrior) -> Progr
 
 
 def _refitted(progress: Progress, mapper: Mapper) -> Progress:
-    """The progress with the box where its faces were seen; no search of the prior is needed."""
+    """The progress with the box fitted to the seen faces, without a search with the prior."""
     state, start = progress.state, refitted(progress.start, progress.state.keyframes)
     if start is progress.start:
         return progress
@@ -280,14 +281,14 @@ def _refitted(progress: Progress, mapper: Mapper) -> Progress:
 
 
 def _changed(pixels: list[Bool[Array, "h w"]], keyframes: tuple[Keyframe, ...]) -> float:
-    """Share of the object's pixels in keyframes that others have taken the place of."""
+    """Number of changed pixels, as a share of the object's earlier pixels in all keyframes."""
     before = [np.asarray(one.segmented) for one in keyframes]
     changed = sum(int((a != np.asarray(b)).sum()) for a, b in zip(before, pixels, strict=True))
     return changed / max(1, sum(int(one.sum()) for one in before))
 
 
 def trajectory(progress: Progress) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """Poses of the frames of a recording, from where their keyframes are now. [host]
+    """Poses of the frames of a recording, from the present poses of their keyframes. [host]
 
     Args:
         progress: Progress of a recording, from `follow`.

@@ -3,7 +3,7 @@
 Each object has a map of its own: its box, its grids, its code. The camera is shared: all maps hold
 the same keyframes at the same poses, a frame is tracked once, against the surfaces of all objects,
 and the keyframes are realigned with all of them at once. All objects of one class are searched in
-one call. A map of one object is the case of one (`build_mapper`).
+one call. A map of one object is a special case (`build_mapper`).
 """
 
 import time
@@ -59,7 +59,7 @@ class Step(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What the functions of a mapper share; none of it changes.
+    """Constant data that the functions of a mapper share.
 
     Attributes:
         prior: The shape prior.
@@ -85,10 +85,11 @@ class Member(NamedTuple):
 
     Attributes:
         parts: Prior and settings of its class.
-        state: Its map, whose keyframes are those of all.
-        cut: From the pose of a new keyframe to its parts and the object's pixels; None for all
-            pixels in the object's box.
-        is_fused: Whether new keyframes are fused into it; False for what only carries the camera.
+        state: Its map; all objects have the same keyframes.
+        cut: Function from the pose of a new keyframe to its parts and the object's pixels; None
+            for all pixels in the object's box.
+        is_fused: Whether new keyframes are fused into it; False for a map that only tracks the
+            camera.
     """
 
     parts: Parts
@@ -106,15 +107,15 @@ def step_all(
 ) -> tuple[list[MapState], Step, Shapes]:
     """Track a frame, unless its pose is given, and map it if it has moved enough.
 
-    A keyframe whose pose is given is moved to where it agrees better with the map, by little.
+    A keyframe with a given pose is moved slightly, to where it agrees better with the map.
 
     Args:
-        members: The objects, one or more, with the settings of the first.
+        members: The objects, one or more; the settings of the first are used.
         prepared: The frame.
         T_given: Its pose; None to track it.
 
     Returns:
-        The maps after the frame, what became of it, and the shapes as refined.
+        The maps after the frame, the outcome of the frame, and the refined shapes.
     """
     tracking, mapping = members[0].parts.tracking, members[0].parts.mapping
     states = [one.state for one in members]
@@ -183,7 +184,7 @@ def _with_keyframe(
 def refine_all(
     members: Sequence[Member], *, is_long: bool = False
 ) -> tuple[list[MapState], Shapes]:
-    """The shapes of what is fused so far, searched on from the ones before.
+    """The shapes that explain all fused keyframes, searched from the previous shapes.
 
     All objects of a class go through one call, whose number of rows is a power of two, so that it
     is compiled for a few numbers of objects only; classes follow one after the other.
@@ -226,7 +227,7 @@ def _searched(
     """The shapes of some objects of one class, and of copies of the last that fill the batch."""
     count = power_of_two(len(states))
     rows = [min(i, len(states) - 1) for i in range(count)]
-    # The same numbers for each: what an object becomes does not depend on what stands beside it.
+    # All objects get the same random numbers, so that no result depends on the other objects.
     key = jax.random.fold_in(parts.key, len(states[0].keyframes))
     occupied, occluded = (
         jnp.stack([getattr(grids[i], name) for i in rows]) for name in ("occupied", "occluded")
@@ -262,18 +263,18 @@ def is_realigned(parts: Parts, state: MapState) -> bool:
 
 
 class Clock:
-    """Seconds of the parts of a step, which wait for what they computed."""
+    """Seconds of the parts of a step; each part includes the wait for its results."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._start = time.perf_counter()
 
     def lap(self, name: str, computed: Any) -> None:
-        """Add the seconds since the last lap to a part, once what it computed is there.
+        """Add the seconds since the last lap to a part, once its results are ready.
 
         Args:
             name: Name of the part.
-            computed: What it computed: any tree of arrays.
+            computed: Its results: any tree of arrays.
         """
         jax.block_until_ready([x for x in jax.tree.leaves(computed) if isinstance(x, jax.Array)])
         now = time.perf_counter()

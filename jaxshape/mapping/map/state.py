@@ -1,4 +1,4 @@
-"""The state of a map: keyframes, what they add up to, and the shape that explains it. [host]"""
+"""The state of a map: keyframes, the measurement fused from them, and its shape. [host]"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -24,7 +24,7 @@ from jaxshape.mapping.tracking.surfels import Lattice, Sums, Surface
 from jaxshape.mapping.tracking.views import DepthView
 from jaxshape.model.shapes import ShapePrior
 
-_LEAST_CAPACITY = 8  # keyframes for which realigning is compiled, even where there are fewer
+_LEAST_CAPACITY = 8  # least number of keyframes for which realigning is compiled
 
 
 class Fusing(NamedTuple):
@@ -97,11 +97,11 @@ def assemble(
         place: Where the object's grids lie in the world.
         keyframes: The keyframes, one or more.
         view: View of the last keyframe.
-        mapping: Settings, of which the way to fuse keyframes matters here.
+        mapping: Settings of mapping; only the way to fuse keyframes is used.
         code: Code of the shape found so far `[d]`; None for the mean code.
         logits: Logits of that shape `[x y z]`; None before anything was measured.
         T_world_camera: Pose of the last frame that was tracked; None for that of the last keyframe.
-        T_before_last: Motion of the camera before that frame; None where there was none since.
+        T_before_last: Motion of the camera to that frame from the one before; None for no motion.
         poses_are_given: Whether the poses were given.
     """
     fusing = fusing_of(mapping, prior.resolution)
@@ -123,7 +123,7 @@ def assemble(
 
 
 def fused_anew(state: MapState) -> MapState:
-    """The state with F, M and the measured surface made from all keyframes where they are now."""
+    """The state with F, M and the measured surface fused from all keyframes at present poses."""
     nothing = state.fusing.fusion.nothing()
     state = state._replace(measurement=nothing, sums=surfels.no_sums())
     for keyframe in state.keyframes:
@@ -191,11 +191,11 @@ def carried(state: MapState, keyframe: Keyframe, view: DepthView) -> MapState:
 
 
 def realigned(states: Sequence[MapState], is_fused: Sequence[bool]) -> list[MapState]:
-    """The maps with all keyframes moved to where they agree with each other and with the shapes.
+    """The maps after all keyframes were moved into agreement with each other and the shapes.
 
     Args:
         states: Maps of one or more objects with the same keyframes, with their shapes refined.
-        is_fused: Whether the keyframes are fused into each; others only keep their poses.
+        is_fused: Whether the keyframes are fused into each map; other maps only get the new poses.
 
     Returns:
         The maps with new poses, fused anew; the last tracked frame moves with the last keyframe.
@@ -234,7 +234,7 @@ def realigned_poses(states: Sequence[MapState]) -> list[jaxlie.SE3]:
     is_keyframe = np.arange(capacity) < count
     information = jnp.where(jnp.asarray(is_keyframe)[:, None, None], information, 0)
     seen = [_seen_by(state, capacity) for state in states]
-    # The number of objects is a power of two, too: the others have no points and no shape.
+    # The number of objects is a power of two, too: the added ones have no points and no shape.
     rows = power_of_two(len(seen))
     clouds, lattice, probability = _stacked([*seen, *[_unseen(seen[0])] * (rows - len(seen))])
     center = jnp.float32(states[0].place.box.T_world_object[:3, 3])
@@ -246,7 +246,7 @@ def realigned_poses(states: Sequence[MapState]) -> list[jaxlie.SE3]:
 
 
 def _seen_by(state: MapState, capacity: int) -> tuple[Any, Lattice, Array]:
-    """What aligns the keyframes of one object: their clouds, its lattice and its shape."""
+    """Data that aligns the keyframes of one object: their clouds, its lattice and its shape."""
     filled = [*state.keyframes, *[state.keyframes[-1]] * (capacity - len(state.keyframes))]
     clouds = _stacked([one.cloud for one in filled])
     return clouds, state.place.lattice, jax.nn.sigmoid(state.logits)
@@ -278,15 +278,15 @@ def capacity_for(count: int) -> int:
         count: Number of keyframes, 1 or more.
 
     Returns:
-        8, 16, 32, ...: with each twice as large as the one before, a map that grows is compiled
-        for a few times only.
+        8, 16, 32, ...: each number is twice the one before, so that a growing map is compiled only
+        a few times.
     """
     return max(_LEAST_CAPACITY, power_of_two(count))
 
 
 @jax.jit
 def _realign(clouds, T, is_keyframe, lattice, probability, odometry, is_fixed, center):
-    # About the object, so that rotations have short arms and positions keep their digits.
+    # Relative to the object's centre, so that rotations have short arms and positions keep digits.
     near = Lattice(lattice.linear, lattice.offset + lattice.linear @ center)
     to_near = jaxlie.SE3.from_translation(-center)
     predicted = jax.vmap(surfels.predicted_surface)(near, probability)
@@ -308,5 +308,5 @@ def _composed_surface(lattice, sums, probability) -> Surface:
 
 @jax.jit
 def no_surface(lattice: Lattice) -> Surface:
-    """The surface of nothing."""
+    """A surface without patches."""
     return surfels.measured_surface(lattice, surfels.no_sums())

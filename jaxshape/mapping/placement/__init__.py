@@ -1,1 +1,1 @@
-"""Placement of the object, its position, orientation and size, by what the prior explains."""
+"""Placement of the object: the position, orientation and size that the prior explains best."""

@@ -1,10 +1,11 @@
 """A point cloud of one object, placed by the prior and turned into F and M. [host]
 
-    place_cloud    which way is up and to the front, and where its box lies
-    cloud_grids    F of the points, and M of what no ray passed
+    place_cloud    the directions up and to the front, and the position of its box
+    cloud_grids    F of the points, and M of the space that no ray passed
 
-Rays are known from the sensor's position to each point; or, shorter, along the normals, since a
-surface can only be measured from outside. Without either nothing is known to be free.
+Rays run from the sensor's position to each point. Without a sensor position, they run a short way
+along the normals, since a surface can only be measured from outside. Without normals either, no
+space is known to be free.
 """
 
 from dataclasses import replace
@@ -30,22 +31,24 @@ AXES = ("y", "z", "-y", "-z", "x", "-x")
 """Directions that may be up, the likelier first."""
 
 SURE_OF_UP, SURE_OF_FRONT = 0.02, 0.01
-"""Nats per point by which other directions must be worse for one to be sure."""
+"""Least margin over other directions, in nats per point, for the up or front direction to be
+sure."""
 
 BELIEVED = (0.3, 2.5)
-"""Largest extents, in metres, at which a cloud is taken as being in metres."""
+"""Range of a cloud's largest extent, in metres, for which a unit of the file is plausible."""
 
 SEARCH = PlacementConfig(yaws=12, overhangs=(0.0, 0.25), kept=3, steps=12, steps_again=50)
 """A short search for each direction that may be up; the best one is then improved further."""
 
 CARVING_RAYS = 20_000
-"""Rays that free space, of those there are."""
+"""Largest number of rays that mark free space."""
 
 NORMAL_REACH = 4 / 32
-"""Length that is free along a normal, as a share of the grid."""
+"""Length of the free space along a normal, as a share of the grid."""
 
 CLEARANCE = 1.5
-"""Voxels in front of a point that its ray does not free: noise, and the slant of the surface."""
+"""Distance in front of a point, in voxels, that its ray does not mark as free, because of noise and
+slanted surfaces."""
 
 
 class PlacedCloud(NamedTuple):
@@ -74,9 +77,9 @@ def place_cloud(
     front: str | None = None,
     seed: int = 0,
 ) -> PlacedCloud:
-    """Find the object's frame and box: of the directions that may be up, that which fits best.
+    """Find the object's frame and box, with the up direction that fits best.
 
-    A cloud whose size cannot be that of the object in metres is brought to its usual size.
+    A cloud whose size in metres is not plausible for the object is scaled to the usual size.
 
     Args:
         cloud: The cloud.
@@ -96,7 +99,7 @@ def place_cloud(
             f"The cloud is {extent:.3g} units large, which cannot be metres; it is taken as "
             f"{extent * metres:.2f} m."
         )
-    if front is not None:  # found in small turns about it
+    if front is not None:  # the search starts from it and makes small turns
         config = replace(SEARCH, yaws=1)
     found = {
         one: _placed(cloud, prior, _level(one, front) * metres, config, seed)
@@ -104,7 +107,7 @@ def place_cloud(
         if front is None or one[-1] != front[-1]
     }
     if not found:
-        axes_to_canonical(str(up), str(front))  # says that they are not perpendicular
+        axes_to_canonical(str(up), str(front))  # raises if they are not perpendicular
     best = min(found, key=lambda one: float(found[one].misfit))
     if not np.isfinite(found[best].misfit):
         raise ValueError("The cloud cannot be placed: too few of its points are finite.")
@@ -122,7 +125,7 @@ def place_cloud(
 
 
 def _metres(cloud: Cloud, config: PlacementConfig) -> float:
-    """Metres in a unit: 1, or 0.001, if that is a size to believe; else what makes it usual."""
+    """Metres in a unit: 1 or 0.001 if the size is then plausible, else the scale to usual size."""
     extent = float(np.ptp(cloud.points, axis=0).max())
     low, high = BELIEVED
     likely = next((unit for unit in (1.0, 0.001) if low <= extent * unit <= high), None)
@@ -154,7 +157,7 @@ _place = jax.jit(placing.place, static_argnames="config")
 def _samples(
     cloud: Cloud, level_from_file: Float[np.ndarray, "3 3"], rng: np.random.Generator
 ) -> RaySamples:
-    """Points on the object, and free points before them, in a level frame and in metres."""
+    """Points on the object, and free points in front of them, in a level frame and in metres."""
     points = cloud.points @ level_from_file.T
     extent = np.ptp(points, axis=0).max()
     surface = points[rng.integers(len(points), size=SURFACE_POINTS)]
@@ -168,7 +171,7 @@ def _samples(
     elif cloud.normals is not None:
         ray = _outward(cloud)[chosen] @ level_from_file.T
         length = np.full(FREE_POINTS, 2 * NORMAL_REACH * extent)
-    else:  # so far away that it says nothing
+    else:  # free points so far away that they carry no information
         ray, length = np.ones((FREE_POINTS, 3)), np.full(FREE_POINTS, 20 * extent)
     ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
     gap = FREE_GAP * extent
@@ -178,7 +181,7 @@ def _samples(
 
 
 def _outward(cloud: Cloud) -> Float[np.ndarray, "n 3"]:
-    """The normals, turned round where most of them point to the middle of the cloud."""
+    """The normals, all flipped if they mostly point towards the middle of the cloud."""
     assert cloud.normals is not None
     middle = (cloud.points.min(axis=0) + cloud.points.max(axis=0)) / 2
     outside = np.sum(cloud.normals * (cloud.points - middle))
@@ -228,7 +231,7 @@ def _passed(
     *,
     stops: bool,
 ) -> Bool[np.ndarray, "x y z"]:
-    """Empty voxels on the lines from points on the surface; `stops` ends lines at another one."""
+    """Empty voxels on lines from surface points; `stops` ends each line at an occupied voxel."""
     n = occupied.shape[0]
     line = end - start
     length = np.linalg.norm(line, axis=1)

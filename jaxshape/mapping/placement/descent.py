@@ -20,7 +20,7 @@ def descend(
     steps: Array | int,
     rise: int,
 ) -> tuple[Any, Float[Array, " h"]]:
-    """Move points down the gradients of their misfits, and return the best that each came by.
+    """Move points down the gradients of their misfits; return the best point on each path.
 
     The steps grow to their full length at first and shrink along a half cosine afterwards.
 
@@ -29,7 +29,7 @@ def descend(
         misfits: Misfit of each point.
         unit: Length of one step in each number of a point.
         steps: Number of steps, 0 or more.
-        rise: Steps until they have their full length, 1 or more.
+        rise: Number of steps until the step length is full, 1 or more.
 
     Returns:
         The points with the lowest misfits, the start among them, and these misfits, infinite where
@@ -55,6 +55,6 @@ def descend(
     still = jax.tree.map(jnp.zeros_like, start)
     infinite = jnp.full(len(jax.tree.leaves(start)[0]), jnp.inf, jnp.float32)
     carry = (still, adam.init(still), still, infinite)
-    # One more step looks at where the last one led.
+    # One more step evaluates the points that the last step led to.
     _, _, best, lowest = lax.fori_loop(0, steps + 1, step, carry)
     return after(best), lowest

@@ -1,7 +1,7 @@
-"""The faces of the object's box, and what the keyframes say of them. [host]
+"""The faces of the object's box, and whether the keyframes have seen them. [host]
 
-A face was seen where rays passed just outside of what was measured: the object ends there, and so
-does its box. The place of a face that was not seen is what the prior expects.
+A face was seen if rays passed just outside of the measured points: the object ends there, and so
+does its box. The prior gives the position of a face that was not seen.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxshape.mapping.placement.placing import PlacementConfig
 from jaxshape.mapping.tracking.keyframes import Keyframe
 
 FACES = (("left side", "right side"), ("bottom", "top"), ("back", "front"))
-"""Names of the faces on the lower and the upper end of each axis, as one who sits there says."""
+"""Names of the faces at the lower and the upper end of each axis, for a person who sits there."""
 
 SEEN = 0.5
 """Share of the space just outside of the object that rays must pass for a face to be seen."""
@@ -24,19 +24,20 @@ BEYOND = 0.05
 """Depth of that space, in metres."""
 
 PADDING = 0.005
-"""Metres between the last measured points and a face that was seen."""
+"""Distance between the outermost measured points and a face that was seen, in metres."""
 
 FIT = 0.02
-"""Metres by which a face may lie apart from where the object was seen to end."""
+"""Distance in metres within which a face must lie from the seen end of the object."""
 
 CLEAR = 0.02
-"""Metres in front of what a ray met at which it has surely passed."""
+"""Distance from a point to the hit of a ray behind it, in metres, at which the ray has surely
+passed the point."""
 
 STRAY = 1 / 400
-"""Share of the measured points beyond a face that are noise."""
+"""Share of the measured points that may lie beyond a face because of noise."""
 
 SPREADS = 2.0
-"""Standard deviations of the logarithms of the extents that the prior's largest object has."""
+"""Size of the prior's largest object, in standard deviations of the logarithms of the extents."""
 
 
 class Cutout(NamedTuple):
@@ -86,10 +87,10 @@ class Faces(NamedTuple):
 
 
 def faces_of(box: Box, views: list[Cutout]) -> Faces | None:
-    """The ends of what was measured of the object along the axes of its box.
+    """The ends of the object's measured points along the axes of its box.
 
     Args:
-        box: The object's box, whose axes count, and whose size tells how large its faces are.
+        box: The object's box, which gives the axes and the size of the faces.
         views: Views of the object.
 
     Returns:
@@ -109,14 +110,14 @@ def faces_of(box: Box, views: list[Cutout]) -> Faces | None:
 
 
 def fitted(box: Box, faces: Faces | None) -> Box:
-    """The box with every face that was seen where the object ends, and none that cuts it.
+    """The box with all seen faces moved to the ends of the object, and no face that cuts it.
 
     Args:
         box: The object's box.
         faces: The ends of the object along its axes; None where nothing was measured.
 
     Returns:
-        The box; if it stands on a floor, which it then excludes, its bottom stays.
+        The box; its bottom does not move if it stands on a floor, which it then excludes.
     """
     if faces is None:
         return box
@@ -129,7 +130,7 @@ def fitted(box: Box, faces: Faces | None) -> Box:
 
 
 def fits(box: Box, faces: Faces | None) -> bool:
-    """Whether the box ends where the object was seen to end, to `FIT`.
+    """Whether the box ends within `FIT` of where the object was seen to end.
 
     Args:
         box: The object's box.
@@ -158,7 +159,7 @@ def between(box: Box, lower: Float[np.ndarray, " 3"], upper: Float[np.ndarray, "
 
 
 def reach_of(box: Box) -> tuple[Box, Box]:
-    """The largest box that an object may fill which is known to fill this one, and its column.
+    """The largest box that an object may fill if it fills at least this one, and its column.
 
     Args:
         box: The object's box, as far as it is known.
@@ -232,9 +233,9 @@ def _passed_outside(
 ) -> float:
     """Share of the space just outside of one end of the object that rays of some view passed.
 
-    The space lies before the middle of the face, down to the bottom of the box: where the back of a
-    chair is all that was measured, the air before it says nothing of the seat. Of its halves, the
-    upper and the lower, the one counts that rays passed less.
+    The space lies in front of the middle of the face, down to the bottom of the box: if only the
+    back of a chair was measured, free space in front of it says nothing about the seat. The result
+    is the smaller share of the two halves of this space, the upper and the lower one.
     """
     low, high = np.minimum(lower, -box.size / 2), np.maximum(upper, box.size / 2)
     rims = 0.1 * (high - low)

@@ -42,22 +42,22 @@ from jaxshape.mapping.tracking.keyframes import Keyframe, as_pose, prepare, resi
 from jaxshape.model.shapes import ShapePrior
 
 SURE = 0.5
-"""Confidence of a segmentation from which a frame may be the first."""
+"""Least confidence of a segmentation for its frame to be the first."""
 
 SURE_OF_PROMPT = 0.1
-"""Confidence from which a frame may be the first where the user gave a prompt."""
+"""Least confidence of a segmentation for its frame to be the first if the user gave a prompt."""
 
 SURE_OF_FRONT = 0.01
-"""Nats per point by which boxes turned otherwise must be worse for the front to be sure."""
+"""Least margin over boxes with other fronts, in nats per point, for the front to be sure."""
 
 FIRST_FRAMES = 10
-"""Frames among which the first that shows the object well is looked for."""
+"""Number of frames that are searched for the first one that shows the object well."""
 
-_NEARLY_LEVEL = np.cos(np.radians(50))  # people tilt cameras down to look at things, by so much
+_NEARLY_LEVEL = np.cos(np.radians(50))  # largest angle by which people tilt cameras down
 _FLOOR_MARGIN = 0.02  # metres above the floor below which nothing counts as the object
-_STEP = 0.04  # metres by which two floors differ that are not the same
+_STEP = 0.04  # metres: least difference in height between two distinct floors
 _USUAL = PlacementConfig()
-_ROOM = 0.15  # by which a box that was estimated is enlarged before the object is cut out with it
+_ROOM = 0.15  # share by which an estimated box is enlarged before it cuts out the object
 
 
 class Start(NamedTuple):
@@ -65,8 +65,10 @@ class Start(NamedTuple):
 
     Attributes:
         index: Number of the frame in the recording, from 0.
-        masked: Pixels of that frame that show the object `[h w]`; None where the box alone tells.
-        core: Those among them that surely do, whatever later frames show `[h w]`; None likewise.
+        masked: Pixels of that frame that show the object `[h w]`; None where the box alone defines
+            the object.
+        core: Pixels among them that surely show the object, whatever later frames show `[h w]`;
+            None likewise.
         box: The object's box in the world.
         T_world_camera: Pose of the frame `[4 4]`.
         T_level_world: World to a frame with the same origin and +y up `[4 4]`; None where the box
@@ -74,8 +76,8 @@ class Start(NamedTuple):
         floor: Height of the floor in the level frame, in metres; NaN where it is not known.
         placement: The placement that the prior found, in the level frame; None where the box was
             given.
-        notes: What was found and how sure that is, in sentences.
-        warnings: Those of the notes that a user should look at.
+        notes: Sentences about the findings and how sure they are.
+        warnings: The notes that a user should look at.
     """
 
     index: int
@@ -262,8 +264,8 @@ def _up(
 ) -> tuple[Float[np.ndarray, " 3"], str]:
     """The upward direction in the world, and where it comes from.
 
-    A floor that is sure counts more than walls, and these more than a level surface that may be a
-    table top; what is left are the axes of the world and the image.
+    A sure floor takes precedence over walls, and walls over a level surface that may be a table
+    top. If none of them is seen, the axes of the world or of the image are used.
     """
     R_world_camera = T_world_camera[:3, :3]
     if vertical is not None and (floor is None or floor.confidence < SURE):
@@ -300,7 +302,7 @@ def _floor_height(floor: Floor | None, T_level_camera: Float[np.ndarray, "4 4"])
 
 
 def rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation that takes a direction to +y, and turns as little else as it can.
+    """The smallest rotation that takes a direction to +y.
 
     Args:
         up: The direction `[3]`, of any length.
@@ -317,17 +319,17 @@ def rotation_onto_y(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def on_the_floor(start: Start, keyframes: tuple[Keyframe, ...]) -> Start:
-    """The start on the floor that the keyframes show; as it is where they show no better one.
+    """The start on the floor that the keyframes show; unchanged where they show no better one.
 
-    Of several floors the surest counts, if all that was measured of the object lies above it, and
-    no higher than the prior's largest objects reach.
+    Of several floors, the most certain one is used. All measured points of the object must lie
+    above it, and no higher than the prior's largest objects reach.
 
     Args:
         start: The object, with its latest box.
         keyframes: The keyframes of the map.
 
     Returns:
-        The start with its up and its box as the floor asks; the same one where nothing changes.
+        The start with up direction and box adapted to the floor; the same one if nothing changes.
     """
     assert start.T_level_world is not None
     points = object_points(cutouts(keyframes))
@@ -426,7 +428,7 @@ def placed_again(
         start: The object, with its latest box.
         prior: The shape prior of its class.
         keyframes: The keyframes of the map.
-        config: Settings of the placement: sizes of the class, and how long it is sought.
+        config: Settings of the placement: sizes of the class, and the length of the search.
     """
     return _placed(start, prior, cutouts(keyframes), config)
 
@@ -437,7 +439,7 @@ def _placed(
     frames: list[Cutout],
     config: PlacementConfig = _USUAL,
 ) -> Start:
-    """The start with the box that the prior finds; as it is where nothing can be placed.
+    """The start with the box that the prior finds; unchanged where nothing can be placed.
 
     Its faces lie where the object was seen to end.
     """
@@ -459,7 +461,7 @@ def _placed(
 
 
 def _in_box(start: Start, box: Box) -> Start:
-    """The start with its box, and its placement in the same one."""
+    """The start with this box, and with its placement moved to the same box."""
     assert start.placement is not None and start.T_level_world is not None
     T_level_object = as_pose(start.T_level_world @ box.T_world_object)
     found = start.placement._replace(T_world_object=T_level_object, size=jnp.float32(box.size))
@@ -476,7 +478,7 @@ _place = jax.jit(placing.place, static_argnums=4)
 
 
 def without_floor(box: Box, floor: float) -> Box:
-    """The box, with what lies on the floor excluded.
+    """The box without the floor and a thin layer above it.
 
     Args:
         box: The box.

@@ -1,21 +1,21 @@
-"""The object's box, found without hand work: where it stands, how it is turned, how large it is.
+"""The object's box, found without hand work: its position, its turn and its size.
 
-The paper (section 4.2) is given the first pose by hand. Here the prior finds it: of many boxes
-around the measured points, the object's own is that in which the network explains them best. In a
-level world a box has seven numbers: its turn about the vertical and two opposite corners.
+In the paper (section 4.2) the first pose is given by hand. Here the prior finds it: among many
+boxes around the measured points, it takes the box in which the network explains the points best. In
+a level world a box has seven numbers: its turn about the vertical and two opposite corners.
 
-    propose     boxes with their fronts all around, that reach more or less far into the unseen
+    propose     boxes with fronts in all directions, which reach more or less far into unseen space
     encode      the shape that the network makes of the points in each box
-    fit         the boxes of the best, moved down the gradient of their misfit, the shapes held
+    fit         the best boxes, moved down the gradient of their misfit while the shapes are held
     encode, fit once more, in the boxes that were found
     improve     the best few, boxes and codes together
-    place       all of it: the best box, and by how much it is better than one turned otherwise
+    place       the whole search: the best box, and its margin over boxes with other fronts
 
-To move a box costs a tenth of moving it with its code, and a code that is encoded anew follows a
-box further than its gradient does.
+Moving a box alone costs a tenth of moving it together with its code. A code that is encoded anew
+also follows the box further than the gradient of the code does.
 
-Boxes are compared by how well points are explained, always the same ones: Eq. 7, a mean over
-voxels, would favour boxes with much free space in them.
+Boxes are compared by how well they explain one fixed set of points: Eq. 7, a mean over voxels,
+would favour boxes that contain much free space.
 """
 
 from collections.abc import Callable
@@ -51,10 +51,10 @@ class PlacementConfig:
             geometric means of the procedural chairs.
         size_spread: Standard deviations of the logarithms of the extents, above 0.
         yaws: Directions of the front to start from, evenly spaced, 1 or more.
-        overhangs: Distances by which boxes reach beyond the measured points where they face away
-            from the camera, in typical sizes, 0 or more.
-        tried: Boxes that are moved with their shapes held, of all those proposed, 1 or more.
-        kept: Boxes that are improved with their codes, of those tried, 1 or more.
+        overhangs: Distances by which boxes reach beyond the measured points on the sides that face
+            away from the camera, in typical sizes, 0 or more.
+        tried: Number of proposed boxes that are moved with their shapes held, 1 or more.
+        kept: Number of tried boxes that are improved together with their codes, 1 or more.
         steps: Steps of Adam that improve each box and its code, 1 or more.
         steps_again: Steps of Adam where an earlier placement is known, 1 or more.
 
@@ -95,20 +95,21 @@ OUTSIDE_WEIGHT = 0.1
 """Nats for every voxel by which a measured point lies outside its box, up to four voxels."""
 
 SIZE_WEIGHT, CODE_WEIGHT = 0.003, 2e-4
-"""Nats per point for one nat of unlikely sizes, and of an unlikely code: points say the same thing
-over and over, so they count far less than independent ones would."""
+"""Weights of the size penalty and of the code penalty, in nats per point for one nat: the points
+are strongly correlated, so they count far less than independent ones would."""
 
 OUTLIERS = 0.03
-"""Share of the points that may be anything: stray depths, a badly cut mask."""
+"""Share of the points that may be outliers, from stray depths or a badly cut mask."""
 
 EMPTY = -8.0
 """Logit outside the grid."""
 
 OTHERWISE, APART = jnp.pi / 6, jnp.pi / 18
-"""Yaws further apart than this, in radians, are different answers, and are improved separately."""
+"""Differences of yaw, in radians, above which two boxes are different answers, and above which they
+are improved separately."""
 
 FIT_STEPS = 15
-"""Steps of Adam with which a box is fitted to a shape that is held."""
+"""Number of steps of Adam that fit a box while its shape is held."""
 
 
 class UprightBox(NamedTuple):
@@ -147,10 +148,10 @@ class Placement(NamedTuple):
         code: Code of the shape that explains the points `[d]`.
         misfit: Negative log-likelihood of the points, in nats per point; infinite where nothing
             could be placed.
-        margin: Misfit of the best box that is turned otherwise, by over 30 degrees, less that of
-            this one, 0 or more. Below 0.01 the front is not to be trusted: the object is as good as
-            symmetric, or was seen from a side that does not tell. Infinite where no other box was
-            worth improving.
+        margin: Misfit of the best box with another front, turned by over 30 degrees, minus the
+            misfit of this box, 0 or more. Below 0.01 the front is not to be trusted: the object is
+            nearly symmetric, or was seen from a side that does not show its front. Infinite where
+            no other box was worth improving.
     """
 
     T_world_object: jaxlie.SE3
@@ -171,15 +172,15 @@ def propose(seen: RaySamples, floor: Float[Array, ""], config: PlacementConfig) 
     Args:
         seen: Points on the object, and points that rays passed.
         floor: Height of the floor, on which the bottom of the boxes lies, in metres; NaN where it
-            is not known: the bottom then lies where the points end, or below, as far as a side
-            that faces away.
+            is not known: the bottom then lies at the lowest points, or as far below them as a side
+            that faces away lies beyond the points.
         config: Settings of the placement.
     """
     yaw = jnp.arange(config.yaws) * (2 * jnp.pi / config.yaws)
     ordered = jnp.sort(seen.surface @ turn(yaw), axis=1)
     stray = len(seen.surface) // 400
     lower, upper = ordered[:, stray], ordered[:, -1 - stray]
-    # Seen at 45 degrees all four sides end within sight, hence the square.
+    # At 45 degrees the camera sees the ends of all four sides, hence the square.
     away = jnp.array([1.0, 0.0, 1.0]) * (seen.away @ turn(yaw))
     away = away.at[:, 1].set(jnp.where(jnp.isnan(floor), -1.0, 0.0))  # legs out of sight
     typical = jnp.mean(jnp.array(config.typical_size)[::2])
@@ -233,16 +234,17 @@ def misfit(
 
 
 def _look_up(values: Float[Array, "x y z"], index: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Values between those of a lattice."""
+    """Values of a lattice, interpolated between its nodes."""
     return map_coordinates(values, list(index.T), order=1, mode="constant", cval=EMPTY)
 
 
 def _corners(logits: Float[Array, "x y z"]) -> Float[Array, "x+1 y+1 z+1"]:
     """The largest logit of the voxels around each corner.
 
-    Interpolated between corners, a point has at least the logit of its voxel, wherever in it the
-    point lies. Between centres it has to lie in the middle of thin surfaces: that turns the box
-    more exactly, but lets it grow until those at its faces do. Hence the mean of both.
+    With interpolation between corners, a point gets at least the logit of its voxel, wherever it
+    lies in the voxel. With interpolation between centres, a point must lie in the middle of a thin
+    surface: this turns the box more exactly, but lets it grow until the points at its faces lie in
+    the middle of a surface, too. Hence the misfit uses the mean of both.
     """
     corners = jnp.pad(logits, 1, constant_values=EMPTY)
     for axis in range(3):
@@ -254,7 +256,7 @@ def _corners(logits: Float[Array, "x y z"]) -> Float[Array, "x+1 y+1 z+1"]:
 
 
 def _surprise(logit: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Negative log-probability of being true, or an outlier."""
+    """Negative log-probability that a point fits its logit or is an outlier."""
     return -jnp.log(OUTLIERS + (1 - OUTLIERS) * jax.nn.sigmoid(logit))
 
 
@@ -268,10 +270,10 @@ def place(
     known: Placement,
     config: PlacementConfig = PlacementConfig(),
 ) -> Placement:
-    """Find the box of an object in a level world, +y up, from what depth frames say of it.
+    """Find the box of an object in a level world, +y up, from points of depth frames.
 
-    The paper (section 4.2) is given the first pose by hand; here the box is found in which the
-    prior explains the points best.
+    In the paper (section 4.2) the first pose is given by hand; here the search finds the box in
+    which the prior explains the points best.
 
     Args:
         prior: The shape prior.
@@ -282,7 +284,7 @@ def place(
             the same program serves both.
         config: Settings of the placement; the defaults are for chairs.
     """
-    # A turn of a box must not sweep it through the world.
+    # Boxes are relative to the object's centre, so that a turn does not move them far.
     center = jnp.median(seen.surface, axis=0)
     seen = seen._replace(surface=seen.surface - center, free=seen.free - center)
     floor = floor - center[1]
@@ -337,11 +339,11 @@ def place(
 
 
 class _Candidate(NamedTuple):
-    """A hypothesis, and what is known of it.
+    """A hypothesis with its shape and misfit.
 
     Attributes:
         hypothesis: The box and the code.
-        own: Features of what was measured in the box, of a decoder that has them.
+        own: Features of the measurement in the box, for a decoder that uses them.
         logits: The shape in the box.
         misfit: Misfit of the hypothesis, infinite where it is not finite.
     """
@@ -353,12 +355,12 @@ class _Candidate(NamedTuple):
 
 
 def _code_penalty(point: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
-    """The part of the misfit that a code has by itself, given as a point of the whitened space."""
+    """The part of the misfit that depends on the code alone, a point of the whitened space."""
     return CODE_WEIGHT * 0.5 * jnp.sum(point**2, axis=-1)
 
 
 def _longer(unit: UprightBox) -> UprightBox:
-    """The unit of steps with which boxes alone are moved, of which there are few."""
+    """Longer unit steps for moving boxes alone, because that takes only a few steps."""
     return jax.tree.map(lambda x: 1.5 * x, unit)
 
 
@@ -377,7 +379,7 @@ def _box_of(known: Placement, center: Float[Array, " 3"]) -> UprightBox:
 
 
 def _most_promising(tried: _Candidate, count: int) -> Int[Array, " k"]:
-    """Indices of the best boxes, no two of which look the same way as long as there are others."""
+    """Indices of the best boxes, with different fronts as long as there are enough fronts."""
     yaw, misfits = tried.hypothesis.box.yaw, tried.misfit
 
     def add(i, carry):

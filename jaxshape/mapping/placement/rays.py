@@ -15,7 +15,7 @@ from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
 
 SURFACE_POINTS, FREE_POINTS = 8192, 4096
-"""Numbers of points of each frame: on the object, enough to fill a grid, and passed by rays."""
+"""Numbers of points of each frame: on the object, enough to fill a grid, and in free space."""
 
 REACH = 1.2
 """Radius of the ball around the object in which rays count, in typical extents."""
@@ -30,8 +30,8 @@ class RaySamples(NamedTuple):
 
     Attributes:
         surface: Measured points of the object `[*batch n 3]`, in metres and in random order.
-        free: Points that were seen through `[*batch m 3]`, in metres, spread evenly over the free
-            rays around the object.
+        free: Points in free space `[*batch m 3]`, in metres, spread evenly over the free parts of
+            the rays around the object.
         away: Direction from the camera to the object `[*batch 3]`; for several frames the mean of
             the unit vectors, which is short where the object was seen from all sides.
     """
@@ -50,7 +50,7 @@ def sample_rays(
 ) -> RaySamples:
     """Samples of one frame, in the frame of its camera; the same number of points for every frame.
 
-    All rays free space, as far as they pass by the object.
+    All rays mark free space, on the stretch where they pass near the object.
 
     Args:
         key: Random key of the samples.
@@ -96,7 +96,7 @@ def _through_ball(
 def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Array, " k"]:
     """Indices drawn with replacement, in proportion to their weights; those of weight 0 never.
 
-    Weights are whole numbers, for rounding in a running sum would let any index be drawn.
+    Weights are whole numbers, because rounding in a running sum would let any index be drawn.
     """
     total = jnp.cumsum(weight)
     mark = jax.random.randint(key, (count,), 0, total[-1])
@@ -104,7 +104,7 @@ def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Arra
 
 
 def pooled(samples: RaySamples, T_world_camera: jaxlie.SE3) -> RaySamples:
-    """Samples of several frames together, as many points as of one.
+    """Samples of several frames together, with as many points as those of one frame.
 
     Frames in which nothing was segmented are left out.
 

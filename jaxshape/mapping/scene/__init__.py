@@ -1,1 +1,1 @@
-"""Scenes: several objects of several classes, found, told apart and kept apart as frames come."""
+"""Scenes: several objects of several classes, detected, classified and tracked as frames come."""

@@ -19,11 +19,11 @@ CHANGED = 0.02
 before it is boxed anew."""
 
 LATER = 45.0
-"""Degrees by which a prior may turn an object whose front is decided."""
+"""Largest angle, in degrees, by which a prior may turn an object whose front is decided."""
 
 MISFIT = 0.5
-"""Share by which a prior may shorten or lengthen a side of the box around the measured cells: it
-knows what is hidden."""
+"""Largest share by which a prior may shorten or lengthen a side of the box around the measured
+cells: the prior knows the hidden parts."""
 
 
 def boxed(thing: Thing, level: Level) -> Box:
@@ -56,14 +56,14 @@ def fits(
     pixels: Sequence[Bool[np.ndarray, "h w"]],
     before: Sequence[Bool[np.ndarray, "h w"]],
 ) -> bool:
-    """Whether an object still fills its box, and the same pixels.
+    """Whether an object still fills its box and still has the same pixels.
 
     Args:
         box: Its box.
         thing: Its cells.
         level: The level frame.
         pixels: Its pixels in each keyframe `[h w]`.
-        before: Those that its map was made from.
+        before: The pixels from which its map was made, in each keyframe `[h w]`.
     """
     T = level.T_level_world @ box.T_world_object
     p = ((thing.index + 0.5) * CELL - T[:3, 3]) @ T[:3, :3]
@@ -88,7 +88,7 @@ def turned_box(box: Box, quarters: int) -> Box:
 
 
 def placed(start: Start, known: SceneClass, keyframes: tuple[Keyframe, ...]) -> Start:
-    """The object in the box that the prior of its class finds; as it was where that is far off.
+    """The object in the box that the prior of its class finds; unchanged if that is far off.
 
     Args:
         start: The object in the box around its cells, its front as decided.

@@ -1,9 +1,10 @@
 """The classes that objects of a scene may be of, and how one is decided. [host]
 
-Each class has a prior. An object is of the class whose prior predicts hidden parts of it clearly
-better than anything else does that is not made for it: the priors of other classes and, where its
-objects have a front, its own prior with the front turned away. A plant is predicted alike from all
-sides, badly; a cube alike from all sides, well; a chair well from its front alone.
+Each class has a prior. An object belongs to the class whose prior predicts hidden parts of it
+clearly better than its rivals do. The rivals are the priors of other classes and, where objects of
+the class have a front, the same prior with the front turned away. The prior of chairs predicts a
+plant equally badly from all sides, a cube equally well from all sides, and a chair well only with
+the right front.
 """
 
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, refiner_for, usual_method
 
 NOTHING = -20.0
-"""Logit of shapes that are not filled."""
+"""Logit of all voxels of a shape that no prior predicts."""
 
 
 class SceneClass(NamedTuple):
@@ -32,10 +33,10 @@ class SceneClass(NamedTuple):
 
     Attributes:
         name: Its name, such as "chair".
-        prior: The prior that decides the class, and rebuilds.
+        prior: The prior that decides the class, and rebuilds its objects.
         placer: The prior that finds boxes of its objects.
         mapper: Tracking and mapping with that prior.
-        sizes: Usual sizes of its objects, and how long boxes are sought.
+        sizes: Usual sizes of its objects, and the length of the search for boxes.
     """
 
     name: str
@@ -50,8 +51,8 @@ class SceneClasses(NamedTuple):
 
     Attributes:
         known: The classes, in the order in which they go through the decoder.
-        unknown: Mapping of objects whose class is not decided, or that are of none: nothing is
-            searched.
+        unknown: Mapper for objects whose class is not decided, or that are of no class: it searches
+            no shapes.
     """
 
     known: tuple[SceneClass, ...]
@@ -67,7 +68,7 @@ class SceneClasses(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What an object is.
+    """The class and the front of an object.
 
     Attributes:
         name: Name of its class; None for none of them.
@@ -101,10 +102,10 @@ FRONTLESS = ("table",)
 
 
 def sizes_of(name: str) -> PlacementConfig:
-    """Usual sizes of a class, for a short search of the box: a box is known beforehand.
+    """Usual sizes of a class, for a short search that starts from a known box.
 
     Args:
-        name: Name of the class; one whose sizes are not known may be of any.
+        name: Name of the class; objects of a class with unknown sizes may have any size.
     """
     typical, spread = SIZES.get(name, ((0.6, 0.6, 0.6), (0.7, 0.7, 0.7)))
     return PlacementConfig(
@@ -127,7 +128,7 @@ def build_classes(
     Args:
         priors: The prior of each class, by the name of the class; one or more.
         placers: Priors that find boxes, by the name of the class; None, and classes that are not
-            named, take the priors themselves.
+            named, use the priors themselves.
         method: How codes are searched (`refiner_for`); None for the usual way of each prior.
         search: Settings of the search.
         mapping: When a frame becomes a keyframe, and how keyframes are fused.
@@ -156,23 +157,23 @@ def build_classes(
 # Decisions -------------------------------------------------------------------------------------
 
 MARGIN, SPREAD = 0.14, 0.025
-"""Evidence, in nats per hidden surface voxel, from which an object is of a class, and the width
-over which the answer goes from unlikely to likely. Of 40 procedural chairs 31 have more, and the
-others, most of them stools without a back, at most 0.05; of 40 tables 2 have more, of 80 things of
-neither class only balls and a plant, which `WORST` excludes."""
+"""Least evidence, in nats per hidden surface voxel, for an object to be of a class, and the width
+over which the answer goes from unlikely to likely. Of 40 procedural chairs, 31 have more evidence;
+the others, most of them stools without a back, have at most 0.05. Of 40 tables, 2 have more; of 80
+objects of neither class, only balls and a plant, which `WORST` excludes."""
 
 OPPOSITE = 0.5
 """Weight of the margin over the opposite front: backs differ from fronts more than sides do."""
 
 WORST = -1.4
-"""Log-likelihood of hidden surface voxels below which no class predicts an object: of balls it is
--1.57 or less, of plants -1.58 or less."""
+"""Least log-likelihood of hidden surface voxels for an object to be of any class. It is -1.57 or
+less for balls, and -1.58 or less for plants."""
 
 
 UNUSUAL = 14.0
-"""Sum of the squared deviations of an object's three extents from the usual ones of a class above
-which it is not of the class. Each deviation is in standard deviations of the extent's logarithm; of
-objects of the class 0.3 % have a larger sum."""
+"""Largest sum of squared deviations of an object's three extents from the usual extents of a class
+for the object to be of that class. Each deviation is in standard deviations of the extent's
+logarithm; 0.3 % of the objects of a class have a larger sum."""
 
 
 def decide(
@@ -253,11 +254,11 @@ def _sigmoid(x: float) -> float:
 
 
 def unfilled(grids: Grids, code: Float[Array, " d"]) -> Reconstruction:
-    """The shape of an object of no class: what was measured, and nothing else.
+    """The shape of an object of no class: the measured voxels and nothing else.
 
     Args:
         grids: Its F and M `[x y z]`.
-        code: Any code `[d]`, which stands for none.
+        code: Any code `[d]`, as a placeholder.
     """
     measured = jnp.asarray(binary(grids).occupied)[None]
     nothing = jnp.full(measured.shape, NOTHING)

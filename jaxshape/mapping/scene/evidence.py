@@ -1,10 +1,10 @@
-"""Which prior explains an object, and which way it looks: what each predicts of hidden parts.
+"""Class and front of an object, from how well each prior predicts hidden parts of it.
 
 A decoder that sees the measurement explains whatever it is shown, so that agreement with the
-measurement says nothing of the class. Here some of what was measured is hidden from the prior, the
-shape is decoded from the rest, and the prediction of the hidden part is scored. A chair's lower
-half follows from its upper half for a prior of chairs, that of a plant does not. Where no prior
-predicts well enough the object is of none of the classes.
+measurement says nothing about the class. Here a part of the measurement is hidden from the prior,
+the shape is decoded from the rest, and the prediction of the hidden part is scored. A prior of
+chairs predicts the lower half of a chair from its upper half, but not the lower half of a plant.
+Where no prior predicts well enough, the object is of none of the classes.
 """
 
 from typing import NamedTuple
@@ -25,14 +25,14 @@ BLOCK = 8
 
 
 class Predicted(NamedTuple):
-    """How well hidden parts were predicted; means over what was hidden, then over hidden parts.
+    """How well hidden parts were predicted; means over hidden voxels, then over hidden parts.
 
     Attributes:
         surface: Log-likelihood of hidden surface voxels `[*batch]`, in nats per voxel.
         free: Log-likelihood of hidden free voxels `[*batch]`, in nats per voxel.
         overlap: Intersection over union of predicted and hidden surface `[*batch]`, from 0 to 1.
-        surprise: Log-likelihood less the one that the prior itself expects `[*batch]`, in nats per
-            voxel; near 0 where the object is as the prior's are, negative where it is not.
+        surprise: Log-likelihood minus its value expected by the prior itself `[*batch]`, in nats
+            per voxel; near 0 for an object like those of the prior, negative for others.
     """
 
     surface: Float[Array, "*batch"]
@@ -65,7 +65,7 @@ def turned(grid: Array, quarters: int) -> Array:
 
 @jax.jit
 def predict_hidden(prior: ShapePrior, grids: Grids) -> Predicted:
-    """Score what a prior predicts of hidden parts, for each front.
+    """Score the predictions of a prior for hidden parts, for each front.
 
     All hidden parts of all objects in all turns go through one call of the decoder.
 
@@ -111,7 +111,7 @@ def _scored(
     either = jnp.sum(jnp.where(p > 0.5, known, surface), axes)
     expected = p * occupied + (1 - p) * free
     got = F * occupied + (1 - F) * free
-    nearby = known * jnp.maximum(p, F)  # most of a grid is free, and surprises nobody
+    nearby = known * jnp.maximum(p, F)  # most of a grid is free space and easy to predict
     return Predicted(
         surface=mean(occupied, surface),
         free=mean(free, empty),

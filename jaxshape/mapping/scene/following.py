@@ -5,8 +5,8 @@
         ...                                # after every frame
     scene = finish_scene(scene, classes)   # classes, fronts, and the last search
 
-Objects share their keyframes with what carries the camera, which is no object and comes first. So
-frames are tracked before the first object is found.
+Objects share their keyframes with the map that tracks the camera. This map holds no object and is
+made first, so that frames are tracked before the first object is found.
 """
 
 from collections.abc import Iterable, Iterator
@@ -34,13 +34,13 @@ from jaxshape.mapping.scene.world import Level
 from jaxshape.mapping.tracking.keyframes import Cut, PreparedFrame, as_pose, prepare
 
 AHEAD = 1.5
-"""Metres in front of the first camera about which its turns are measured before there is an object.
-"""
+"""Distance in metres from the first camera to the point about which its turns are measured before
+there is an object."""
 
 
 VIEWS, LITTLE = 2, 0.05
-"""Keyframes that must show an object for its class to be decided, and the share of the pixels of
-the fullest one from which a keyframe shows it."""
+"""Number of keyframes that must show an object before its class is decided, and the least share of
+pixels for a keyframe to show it, relative to the keyframe with most pixels of the object."""
 
 
 class SceneObject(NamedTuple):
@@ -67,7 +67,7 @@ class Scene(NamedTuple):
     """A room and the objects in it.
 
     Attributes:
-        camera: What carries the camera: the map of no object, with all keyframes.
+        camera: The map that tracks the camera: it has all keyframes, and no object.
         objects: The objects, in the order of their numbers.
         level: The level frame; None before a floor was seen.
         tracks: The tracked objects: which appeared, were joined, parted and moved.
@@ -115,7 +115,7 @@ def follow_scene(
 def _begin(
     sequence: Sequence, classes: SceneClasses, first: int, use_poses: bool
 ) -> tuple[int, Scene]:
-    """The scene after its first frame, and the number of that."""
+    """The number of the first frame, and the scene after that frame."""
     index, frame = first_readable(sequence, first, use_poses)
     prepared = prepare(frame)
     T = np.eye(4) if not use_poses else np.asarray(frame.T_world_camera, np.float64)
@@ -151,7 +151,7 @@ def _next(
 
 
 def _recut(scene: Scene, looks: list[Look], prepared: PreparedFrame, progress: Progress) -> Cut:
-    """How an object is cut out of a new keyframe: by a look around that all objects share."""
+    """How an object is cut out of a new keyframe: by one look around, shared by all objects."""
     number = next((one.thing.number for one in scene.objects if one.progress is progress), 0)
 
     def cut(T: jaxlie.SE3):
@@ -190,7 +190,7 @@ def _with_look(scene: Scene, look: Look, classes: SceneClasses) -> Scene:
 
 
 def _appeared(scene: Scene, thing: Thing) -> SceneObject:
-    """A new object: the keyframes of all, in a box that it does not fill yet."""
+    """A new object: a box around its cells and the shared keyframes, not yet mapped."""
     assert scene.level is not None
     camera = scene.camera
     box = boxed(thing, scene.level)
@@ -203,7 +203,7 @@ def _appeared(scene: Scene, thing: Thing) -> SceneObject:
 def _boxed_anew(
     scene: Scene, one: SceneObject, look: Look, classes: SceneClasses
 ) -> SceneObject | None:
-    """The object in a box around its cells; None where it is as it was."""
+    """The object in a new box around its cells; None if the present box still fits."""
     assert scene.level is not None
     progress = one.progress
     views = shown(scene.camera.state.keyframes)
@@ -232,7 +232,7 @@ def _placed_in(
 def _refined(
     objects: list[SceneObject], which: list[int], classes: SceneClasses, *, is_long: bool = False
 ) -> list[SceneObject]:
-    """The objects, some of them with their shapes searched; those of a class in one call."""
+    """The objects with some shapes searched; objects of one class go through one call."""
     members = [Member(_parts(objects[i], classes), objects[i].progress.state) for i in which]
     states, shapes = refine_all(members, is_long=is_long)
     found = list(objects)

@@ -26,7 +26,7 @@ from jaxshape.mapping.segmentation.parts import Parts
 from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame
 
 SURE_FLOOR = 0.5
-"""Evidence from which a level plane of a keyframe is the floor of the room."""
+"""Least evidence for a level plane of a keyframe to be the floor of the room."""
 
 
 class Shown(NamedTuple):
@@ -42,7 +42,7 @@ class Shown(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What is seen of a scene once a keyframe is added.
+    """The objects that are visible in a scene once a keyframe is added.
 
     Attributes:
         new: The new keyframe.
@@ -58,7 +58,7 @@ class Look(NamedTuple):
         """The pixels of the new keyframe that show an object.
 
         Args:
-            number: Number of the object; none has the number 0.
+            number: Number of the object; no object has the number 0.
         """
         thing = next((one for one in self.tracks.things if one.number == number), None)
         if thing is None:
@@ -93,11 +93,11 @@ def look_around(
     level: Level | None,
     tracks: Tracks,
 ) -> Look:
-    """What all keyframes show, and which objects that are.
+    """Find the objects that all keyframes show together.
 
     Args:
         keyframes: The keyframes so far, with their parts.
-        new: One more, and its pose; None to look at those alone.
+        new: One more frame, and its pose; None to look at the keyframes alone.
         level: The level frame, if it is known.
         tracks: The tracked objects so far.
     """
@@ -114,7 +114,7 @@ def look_around(
 
 
 def scene_parts(prepared: PreparedFrame) -> Parts:
-    """The parts of a frame in which tables are objects; where a mask tells, those of the mask.
+    """The parts of a frame, with tables as objects; if a mask numbers objects, its parts.
 
     Args:
         prepared: The frame.

@@ -9,10 +9,10 @@ from jaxtyping import Int
 from jaxshape.mapping.scene.world import Cluster, keys_of
 
 SAME = 0.3
-"""Share of the smaller of an object and a cluster from which both may be the same."""
+"""Least share of common cells in the smaller of an object and a cluster for both to be the same."""
 
 SWALLOWED = 0.5
-"""Share of an object that lies in the cluster of another one from which both are one object."""
+"""Least share of an object in the cluster of another object for both to be one object."""
 
 
 class Thing(NamedTuple):
@@ -22,7 +22,7 @@ class Thing(NamedTuple):
         number: Its number, from 1, which it keeps.
         keys: Keys of its cells, rising `[n]`.
         index: Indices of its cells `[n 3]`.
-        is_moved: Whether it came or went while it was filmed.
+        is_moved: Whether it appeared or vanished while the room was filmed.
         is_on_top: Whether it stands on a table.
         is_numbered: Whether masks give its number, and its pixels.
     """
@@ -41,7 +41,7 @@ class Tracks(NamedTuple):
     Attributes:
         things: The objects.
         events: What appeared, was joined, parted, moved or vanished, in sentences.
-        numbers: Numbers that were ever given.
+        numbers: Count of the numbers given so far.
     """
 
     things: tuple[Thing, ...] = ()
@@ -50,11 +50,11 @@ class Tracks(NamedTuple):
 
 
 def associate(before: Tracks, clusters: Sequence[Cluster]) -> Tracks:
-    """The tracked objects once more of the scene was seen: data association.
+    """Data association: assign the clusters of the scene to the tracked objects.
 
     An object is the cluster with which it shares most cells. Of two objects in one cluster the
-    larger one stays; of two clusters of one object the larger one is that object. What is left over
-    is new.
+    larger one stays; of two clusters of one object the larger one is that object. Clusters that are
+    left over are new objects.
 
     Args:
         before: The objects so far.
@@ -96,7 +96,7 @@ def associate(before: Tracks, clusters: Sequence[Cluster]) -> Tracks:
 def _matched(
     shared: Int[np.ndarray, "thing cluster"], least: Int[np.ndarray, "thing cluster"]
 ) -> dict[int, int]:
-    """The object that each cluster is; pairs that share most cells come first."""
+    """The object of each cluster; pairs that share most cells are matched first."""
     found: dict[int, int] = {}
     order = np.argsort(-shared, axis=None, kind="stable")
     for i, j in zip(*np.unravel_index(order, shared.shape), strict=True):

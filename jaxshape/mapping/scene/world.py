@@ -1,8 +1,8 @@
 """What stands in a room, from all keyframes at once: cells of space, and their clusters. [host]
 
-One frame cuts things apart that belong together and joins things that only look close. So the
-points of all keyframes are put into cells of a grid of the world; a cell that frames saw through
-more often than they met something in it is dropped; what is left falls into clusters. As frames
+A single frame separates things that belong together, and joins things that only look close. So the
+points of all keyframes are put into cells of a grid of the world. A cell is dropped if more
+keyframes saw through it than measured something in it. The remaining cells form clusters. As frames
 come, clusters appear, join and part by themselves.
 """
 
@@ -19,41 +19,45 @@ CELL = 0.03
 """Edge length of a cell, in metres: things closer than that are one cluster."""
 
 FLOOR_MARGIN = 0.03
-"""Metres above the floor below which nothing is a thing, on top of the noise of depth."""
+"""Height above the floor, in metres and added to the depth noise, below which nothing is an object.
+"""
 
 LOW = 0.1
-"""Metres above the floor below which cells do not join clusters: floors are uneven, poses err, and
-a keyframe that shows little floor takes it for a thing."""
+"""Height above the floor, in metres, below which cells do not join clusters: floors are uneven,
+poses err, and a keyframe that shows little floor takes it for an object."""
 
 THROUGH = 0.05
-"""Metres behind a cell from which a depth says that the cell is free, on top of its noise."""
+"""Least distance of a measured depth behind a cell, in metres and added to the depth noise, for the
+cell to be free."""
 
 NOISE = 4.8e-3
 """Three standard deviations of depth at 1 m, in metres; they grow with the square of depth."""
 
 TOP_HEIGHT, TOP_AREA, TOP_FILLED = 0.58, 0.2, 0.6
-"""A level slice of a cluster is a table top from this height above the floor, in metres, this area,
-in square metres, and this share of the rectangle around it. Seats are smaller or have a back."""
+"""Least height above the floor in metres, least area in square metres, and least share of the
+rectangle around it, for a level slice of a cluster to be a table top. Seats are smaller or have a
+back."""
 
 LEAST_CELLS = 40
-"""Cells of the smallest object."""
+"""Number of cells of the smallest object."""
 
 LONGEST, TALLEST, LEAST_HEIGHT = 2.6, 2.2, 0.1
-"""Metres: longest side of an object along the floor, and its greatest and least height."""
+"""Greatest extent of an object along the floor, and its greatest and least height, in metres."""
 
 ABOVE_FLOOR = 0.3
-"""Metres of the lowest cell above the floor from which something has to support it."""
+"""Height of a cluster's lowest cell above the floor, in metres, from which it needs a support."""
 
 FRAGMENT, COVERED, HIGHER = 0.3, 0.7, 0.45
-"""A cluster is a part of another one if it has at most this share of its cells, this share of its
-footprint lies within that of the other, and the gap between their heights is at most that, in
-metres."""
+"""A cluster is a fragment of a larger one if it has at most the first share of the larger one's
+cells, at least the second share of it stands on the larger one's footprint, and the gap between
+their heights is at most the third value, in metres."""
 
 LOST = 2
-"""Keyframes in a row that saw through a cell, after others met something there, or before."""
+"""Number of keyframes that must see through a cell, all of them after or all of them before others
+measured something there, for the cell to have changed."""
 
 CHANGED = 0.3
-"""Share of the cells of a cluster that appeared or vanished from which it was moved."""
+"""Share of cells that appeared or vanished above which a cluster was moved."""
 
 
 class Cells(NamedTuple):
@@ -61,8 +65,8 @@ class Cells(NamedTuple):
 
     Attributes:
         index: Index of each cell along the axes of the level frame `[n 3]`.
-        hits: Keyframes that met something in it `[n]`.
-        through: Keyframes that saw through it `[n]`.
+        hits: Number of keyframes that measured something in it `[n]`.
+        through: Number of keyframes that saw through it `[n]`.
         is_changed: True where it was free at first and filled later, or the other way round `[n]`.
     """
 
@@ -77,7 +81,7 @@ class Cluster(NamedTuple):
 
     Attributes:
         index: Its cells `[n 3]`.
-        is_moved: Whether it came or went while it was filmed.
+        is_moved: Whether it appeared or vanished while the room was filmed.
         is_on_top: Whether it stands on a table.
     """
 
@@ -99,7 +103,7 @@ class Level(NamedTuple):
 
 
 def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
-    """The cells in which keyframes met something that is neither floor nor wall.
+    """The cells in which keyframes measured something that is neither floor nor wall.
 
     Args:
         views: Keyframes in their order, with the pixels that show neither floor nor wall.
@@ -112,13 +116,13 @@ def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
     key = keys_of(index)
     hit = np.array([np.isin(key, keys_of(one)) for one in met]).reshape(len(views), -1)
     passed = np.array([_seen_through(centers, view) for view in views]).reshape(hit.shape) & ~hit
-    # A thin thing is met beside its cells where poses err, and is not gone.
+    # Where poses err, a thin object is measured beside its cells; it has not vanished.
     near = np.array([_beside(index, one) for one in met]).reshape(hit.shape)
     return Cells(index, hit.sum(axis=0), passed.sum(axis=0), _changed(near, passed & ~near))
 
 
 def _beside(index: Int[np.ndarray, "n 3"], met: Int[np.ndarray, "m 3"]) -> Bool[np.ndarray, " n"]:
-    """Cells that are among some others or touch them."""
+    """Cells that are among other cells or touch them."""
     if not len(met):
         return np.zeros(len(index), bool)
     low = index.min(axis=0)
@@ -149,7 +153,7 @@ def cells_met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
 def above_floor(
     points: Float[np.ndarray, "n 3"], z: Float[np.ndarray, " n"], level: Level
 ) -> Bool[np.ndarray, " n"]:
-    """Points that are surely no floor.
+    """Points that surely do not belong to the floor.
 
     Args:
         points: Points in the level frame `[n 3]`, in metres.
@@ -226,9 +230,9 @@ def clusters_of(cells: Cells, level: Level) -> list[Cluster]:
 def _apart(
     index: Int[np.ndarray, "n 3"], hits: Int[np.ndarray, " n"], least: int = 1
 ) -> list[Int[np.ndarray, "_ 3"]]:
-    """Clusters of cells; what is too large for an object is cut where few keyframes saw it.
+    """Clusters of cells; one too large for an object is cut where few keyframes measured it.
 
-    Bridges between things are made by noise, and seen by one keyframe or two.
+    Bridges between objects come from noise, and only one or two keyframes measure them.
     """
     kept = hits >= least
     found, of_cell = [], dict(zip(keys_of(index).tolist(), hits.tolist(), strict=True))
@@ -254,7 +258,7 @@ def _with_feet(
 
 
 def _connected(index: Int[np.ndarray, "n 3"]) -> list[Int[np.ndarray, "_ 3"]]:
-    """Cells that touch, even if at a corner only, without specks."""
+    """Groups of cells that touch, at least at a corner, without specks."""
     if not len(index):
         return []
     low = index.min(axis=0)
@@ -269,7 +273,7 @@ def _connected(index: Int[np.ndarray, "n 3"]) -> list[Int[np.ndarray, "_ 3"]]:
 def _off_the_table(
     index: Int[np.ndarray, "n 3"], floor: float
 ) -> list[tuple[Int[np.ndarray, "_ 3"], bool]]:
-    """A cluster, and apart from it what stands on its table top."""
+    """A cluster, and separately the objects on its table top, each marked with True."""
     top = _table_top(index, floor)
     if top is None:
         return [(index, False)]
@@ -295,7 +299,7 @@ def _table_top(index: Int[np.ndarray, "n 3"], floor: float) -> int | None:
 
 
 def _joined(parts: list[Int[np.ndarray, "_ 3"]]) -> list[Int[np.ndarray, "_ 3"]]:
-    """Clusters with the fragments that stand on their footprints, as a leg that was half hidden."""
+    """Clusters joined with the fragments on their footprints, such as a half hidden leg."""
     parts, whole = sorted(parts, key=len, reverse=True), []
     for part in parts:
         for i, other in enumerate(whole):
@@ -328,7 +332,7 @@ def _is_too_large(index: Int[np.ndarray, "n 3"]) -> bool:
 
 
 def _stands(index: Int[np.ndarray, "n 3"], floor: float) -> bool:
-    """Whether a cluster reaches down to the floor, nearly."""
+    """Whether a cluster reaches down to the floor or nearly so."""
     return bool((index[:, 1].min() - floor) * CELL < ABOVE_FLOOR)
 
 

@@ -1,13 +1,14 @@
 """Which parts of many frames are the object, decided together. [host]
 
 A part of one frame belongs to the object if it lies in the object's box and next to, above or below
-what is known of the object, or if it shows again what is known to be the object and ends within the
-prior's reach: so that a box which was cut too short does not exclude what it should have held, and
-one that reaches too far does not hold the table beside. So does a part that two frames show
-together with the object: the seat below a back that was all that the first frame showed. Parts that
-other frames show apart from the object, or that go on beyond its reach, are something else. What
-stands under a table top may be the leg of the table, and what is at the border of the image may be
-the corner of something nearer: such parts are the object only where other frames show it there.
+known points of the object. A part also belongs to the object if it shows known points again and
+ends within the prior's reach. So a box that is too short does not exclude parts of the object, and
+a box that is too large does not include the table beside it. A part that two frames show together
+with the object belongs to it, too: for example the seat, if the first frame showed only the back
+above it. Parts that other frames show apart from the object, or that extend beyond its reach, are
+something else. A part under a table top may be the leg of the table, and a part at the border of
+the image may be the corner of something nearer: such parts are the object only where other frames
+show it there.
 """
 
 from typing import NamedTuple
@@ -21,28 +22,30 @@ from jaxshape.mapping.segmentation.parts import SPECK
 from jaxshape.mapping.segmentation.specks import confirmed
 
 NEAR = 0.03
-"""Metres within which two frames have measured the same thing."""
+"""Distance between points of two frames, in metres, within which both measured the same surface."""
 
 MOSTLY, WHOLLY = 0.5, 0.95
-"""Share of a part that lies in the box of the object, and within its reach, to be part of it."""
+"""Least share of a part in the object's box, and least share within its reach, for the part to
+belong to the object."""
 
 AGAIN = 0.1
-"""Share of a part that was measured before, as the object, to be the object seen again."""
+"""Least share of a part that lies at known points of the object for the part to show it again."""
 
 BESIDE, ALONG = 0.06, 1.0
-"""Metres, sideways and along the vertical, within which a part adjoins the object."""
+"""Largest distance, sideways and along the vertical, at which a part adjoins the object, in
+metres."""
 
 EDGE, UNDER = 0.03, 0.95
-"""Metres by which a table top reaches further than was measured of it, and the share of a part that
-is below it to stand under it."""
+"""Distance in metres by which a table top reaches beyond its measured points, and the least share
+of a part below the table top for the part to stand under it."""
 
 FOREIGN = 0.2
-"""Share of a part above which measurements of other things cut it."""
+"""Share of a part at measured points of other things above which the part is cut."""
 
 ROUNDS = 4
-"""Times at which parts are judged again with what the last ones added."""
+"""Largest number of rounds; each judges all parts again with the points added by the last one."""
 
-_SAMPLE = 500  # points of each part that are asked
+_SAMPLE = 500  # points of each part that are compared
 _SPACING = 0.01  # metres between the points of the object that are kept
 
 
@@ -51,8 +54,8 @@ class Seen(NamedTuple):
 
     Attributes:
         points: Points of the pixels, in metres; NaN where nothing was measured `[h w 3]`.
-        labels: Part of each pixel, from 1; 0 for floor, walls and table tops, `SPECK` for what is
-            too small to be a part `[h w]`.
+        labels: Part of each pixel, from 1; 0 for floor, walls and table tops, `SPECK` for pieces
+            that are too small to be a part `[h w]`.
         sure: True on pixels that are known to show the object `[h w]`.
         corners: Labels of the parts that may be corners of something nearer `[n]`.
         tops: Number of the table top of each pixel, from 1; 0 elsewhere `[h w]`; None for none.
@@ -68,7 +71,7 @@ class Seen(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """One part of a frame, and how it lies.
+    """One part of a frame, and its position relative to the object.
 
     Attributes:
         frame: Number of the frame that it is in.
@@ -90,12 +93,12 @@ class _Part(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What was measured, in trees that find the nearest point.
+    """Measured points, in trees that find the nearest point.
 
     Attributes:
         ours: Points of the object.
-        columns: The same in the frame of its box, low in height, so that what is above and below
-            them is near.
+        columns: The same points in the frame of its box, with compressed heights, so that points
+            above and below them are near.
         others: Points of other things.
     """
 
@@ -113,8 +116,8 @@ def belonging(
         frames: The frames, in the world.
         box: The object's box, as far as it is known.
         reach: The largest box that the object may turn out to fill.
-        column: The part of the reach above and below the box: what lies there and is not known to
-            be the object is not known to be something else.
+        column: The part of the reach above and below the box: a part that lies there and is not
+            known to be the object is still undecided, not something else.
 
     Returns:
         For each frame, True on the object `[h w]`.
@@ -150,9 +153,9 @@ def belonging(
 
 
 def _is_ours(part: _Part, known: _Known, box: Box) -> bool:
-    """Whether a part is the object, all of it or some.
+    """Whether a part is the object, entirely or in part.
 
-    What may be something else is so only if other frames show it as the object.
+    A doubtful part is the object only if other frames show it as the object.
     """
     again = float(_near(part.points, known.ours).mean())
     if part.is_doubtful:
@@ -167,7 +170,7 @@ def _adjoins(part: _Part, columns: KDTree, box: Box) -> bool:
 
 
 def _trees(clouds: list[Float[np.ndarray, "_ 3"]], box: Box) -> tuple[KDTree, KDTree]:
-    """Points of the object, and their columns."""
+    """Trees of the object's points, at their heights and at compressed heights."""
     return _tree(clouds), _tree([_flat(points, box) for points in clouds])
 
 
@@ -179,7 +182,7 @@ def _flat(points: Float[np.ndarray, "n 3"], box: Box) -> Float[np.ndarray, "n 3"
 def _together(
     parts: list[_Part], ours: list[_Part], whole: set[tuple[int, int]], frames: list[Seen]
 ) -> list[_Part]:
-    """The parts that belong together with the object in their frames, where two frames say so."""
+    """The parts that their frames pair with the object, if two frames agree on them."""
     sure = {part[:2] for part in ours if part[:2] in whole}
     partners = {
         (frame, int(b))
@@ -201,12 +204,12 @@ def _is_apart(part: _Part) -> bool:
 
 
 def _is_whole(part: _Part, known: _Known) -> bool:
-    """Whether nothing of a part of the object is anything else."""
+    """Whether a part of the object contains nothing else."""
     return part.in_reach > WHOLLY and float(_foreign(part.points, known).mean()) < FOREIGN
 
 
 def _foreign(points: Float[np.ndarray, "n 3"], known: _Known) -> Bool[np.ndarray, " n"]:
-    """Points where other things were measured, and not the object."""
+    """Points at which other things were measured, but not the object."""
     return _near(points, known.others) & ~_near(points, known.ours)
 
 
@@ -217,7 +220,7 @@ def _near(points: Float[np.ndarray, "n 3"], tree: KDTree) -> Bool[np.ndarray, " 
 def _pixels(
     seen: Seen, ours: list[_Part], whole: set[tuple[int, int]], known: _Known, box: Box, reach: Box
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the parts that are the object; of those that are more than it, those in its box."""
+    """Pixels of the parts of the object; of parts that contain other things, pixels in its box."""
     in_whole = np.isin(seen.labels, [part.label for part in ours if part[:2] in whole])
     found = (seen.sure | in_whole) & points_in_box(seen.points, reach)
     mixed = np.isin(seen.labels, [part.label for part in ours if part[:2] not in whole])
@@ -229,7 +232,7 @@ def _pixels(
 def _with_specks(
     frames: list[Seen], found: list[Bool[np.ndarray, "h w"]], known: _Known, reach: Box
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """The pixels with those of specks that other frames confirm."""
+    """The object's pixels, together with the specks that other frames confirm."""
     loose = [(seen.labels == SPECK) & points_in_box(seen.points, reach) for seen in frames]
     for seen, pixels in zip(frames, loose, strict=True):
         pixels[pixels] = ~_foreign(seen.points[pixels], known)
@@ -264,7 +267,7 @@ class _Top(NamedTuple):
 
     Attributes:
         height: Its height, in metres.
-        hull: The lines around it `[n 3]`: x, z and 1 times each are negative inside.
+        hull: The lines around it `[n 3]`: inside, the product of (x, z, 1) with each is negative.
     """
 
     height: float
@@ -299,7 +302,7 @@ def _background(seen: Seen, column: Box) -> Float[np.ndarray, "n 3"]:
 
 
 def _tree(clouds: list[Float[np.ndarray, "_ 3"]]) -> KDTree:
-    """Points of some clouds, one in each small cell."""
+    """A tree of the points of some clouds, one point in each small cell."""
     points = np.concatenate([np.zeros((0, 3)), *clouds])
     cells = np.floor(points / _SPACING).astype(np.int64)
     return KDTree(points[np.sort(np.unique(cells, axis=0, return_index=True)[1])])

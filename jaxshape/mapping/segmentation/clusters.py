@@ -25,8 +25,8 @@ WORKING_WIDTH = 320
 """Clusters are found in images of about this width, in pixels."""
 
 WALL, TABLE, SHEET = 0.75, 0.5, 1.2
-"""A plane is no part of the object if its shorter side, in metres, exceeds the first where nothing
-is seen behind it, the second where it is level and higher than a seat, the third anywhere."""
+"""Limits of the shorter side of a plane, in metres, above which it is no part of the object: for a
+plane with nothing seen behind it, for a level plane higher than a seat, and for any plane."""
 
 SEAT = 0.6
 """Level planes higher than this above the floor, in metres, are seats only if they are small."""
@@ -41,12 +41,12 @@ GROWTH = 0.1
 """Largest distance of legs outside the footprint of the parts above them, in metres."""
 
 LARGER, BESIDE = 5, 4
-"""How many times larger than the corner of something nearer is what it hides, and the pixels within
-which it lies beside that and beside the border of the image: shadows of depth cameras are as wide,
-and so is the border where they measure nothing."""
+"""A corner of something nearer hides a cluster that is more than the first number times larger. It
+lies within the second number of pixels of that cluster and of the border of the image: shadows of
+depth cameras are that wide, and so is the border where they measure nothing."""
 
 MOST = 9
-"""Groups of clusters that are proposed as objects."""
+"""Largest number of groups of clusters that are proposed as objects."""
 
 SPECK = 0.003
 """Share of the image below which a group of clusters is not proposed."""
@@ -55,7 +55,7 @@ SMALLEST = 12
 """Clusters of fewer pixels are noise."""
 
 SURE_FLOOR = 0.3
-"""A floor less certain than this may be a table top, and would cut all that is below it."""
+"""A floor less certain than this may be a table top, and would remove everything below it."""
 
 Image = Bool[np.ndarray, "h w"]
 Pixel = tuple[float, float]
@@ -65,7 +65,7 @@ class Scene(NamedTuple):
     """A depth frame reduced to the working width, and its planes.
 
     Attributes:
-        stride: Of this many rows and columns of the frame, the middle one is kept.
+        stride: Number of rows, and of columns, of the frame of which the middle one is kept.
         points: Points in the camera frame, in metres; NaN where nothing was measured.
         spacing: Distance between the rays of neighbouring pixels at a depth of 1 m, in metres.
         planes: Dominant planes of the frame, largest first.
@@ -91,7 +91,8 @@ def look(
     Args:
         depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.
         K: Camera matrix `[3 3]`, in pixels.
-        stride: Of this many rows and columns one is kept; None for about the working width.
+        stride: Number of rows, and of columns, of which one is kept; None for about the working
+            width.
     """
     stride = stride or max(1, round(depth.shape[1] / WORKING_WIDTH))
     points = reduced(camera_points(depth, K), stride)
@@ -109,9 +110,9 @@ def reduced(image: np.ndarray, stride: int) -> np.ndarray:
 
 
 def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> np.ndarray:
-    """A segmentation at full size.
+    """Upsample a segmentation to full size.
 
-    Each pixel takes the value of that reduced pixel around it which is nearest in depth.
+    Each pixel copies the value of the neighbouring reduced pixel that is closest in depth.
     """
     (h, w), stride = segmented.shape, view.stride
     if stride == 1:
@@ -131,7 +132,7 @@ def enlarged(segmented: Image, view: Scene, depth: Float[np.ndarray, "H W"]) -> 
 
 
 class Background(NamedTuple):
-    """What is no part of an object.
+    """Pixels that are no part of an object.
 
     Attributes:
         pixels: True on and behind floor and walls, and on table tops `[h w]`.
@@ -156,7 +157,7 @@ def background(view: Scene, click: Pixel | None, *, with_tables: bool = True) ->
     for plane in view.planes:
         if plane is floor:
             continue
-        # A plane goes on through whatever stands across it: what counts are its connected parts.
+        # A plane continues through objects that cross it, so its connected parts are judged.
         labels = clusters(view, on_plane(plane, view.points) & ~found)
         parts = [labels == label for label in range(1, labels.max() + 1)]
         parts = [part for part in parts if not _is_clicked(part, click)]
@@ -192,13 +193,13 @@ def _shorter_side(points: Float[np.ndarray, "n 3"]) -> float:
 
 
 def _is_wall(plane: Plane, parts: list[Image], sides: list[float], view: Scene) -> bool:
-    """Large, cut by the border of the image, and with next to nothing seen behind it."""
+    """Whether a plane is large, cut by the image border, and has next to nothing behind it."""
     large = any(side > WALL and cut(part) > 0 for part, side in zip(parts, sides, strict=True))
     return large and nothing_below(plane, view.points.reshape(-1, 3)) > 0
 
 
 def _is_table_top(plane: Plane, floor: Plane) -> bool:
-    """Level, and higher above the floor than a seat."""
+    """Whether a plane is level, and higher above the floor than a seat."""
     level = plane.normal @ floor.normal > np.cos(np.deg2rad(8))
     return bool(level) and floor.offset - plane.offset > SEAT
 
@@ -228,17 +229,17 @@ def clusters(view: Scene, free: Image) -> Int[np.ndarray, "h w"]:
 def jumps(
     z: Float[np.ndarray, "h w"], other: Float[np.ndarray, "h w"], spacing: float
 ) -> Bool[np.ndarray, "h w"]:
-    """Whether the depths of neighbouring pixels are of two surfaces; noise and slopes are not."""
+    """Whether neighbouring pixels lie on two surfaces; noise and slopes do not count as jumps."""
     nearer = np.fmin(z, other)
     return np.abs(z - other) > tolerance(nearer) + 2.5 * spacing * nearer
 
 
 def joined(labels: Int[np.ndarray, "h w"], main: int, view: Scene) -> list[int]:
-    """The main cluster, and those that belong to it: legs and slats which its own parts cut off.
+    """The main cluster and those that belong to it: legs and slats cut off by its other parts.
 
     Clusters belong together if most of one stands on the footprint of the other, which is no larger
-    than furniture, or if one is much smaller and next to the other in space; but not if it is the
-    corner of something nearer that reaches into the image.
+    than furniture, or if one is much smaller and next to the other in space. The corner of
+    something nearer that reaches into the image belongs to no cluster.
     """
     present = np.unique(labels[labels > 0]).tolist()
     clouds = {label: view.points[labels == label] for label in present}
@@ -271,7 +272,7 @@ def pairs(labels: Int[np.ndarray, "h w"], view: Scene) -> list[tuple[int, int]]:
 
 
 def _some(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Every so many of the points, a few hundred in all."""
+    """A regular subset of the points, a few hundred in all."""
     return points[:: 1 + len(points) // 500]
 
 
@@ -284,7 +285,7 @@ def _may_touch(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"]) -
 def corners(labels: Int[np.ndarray, "h w"], view: Scene) -> list[int]:
     """Small clusters at the border of the image that hide some of a far larger one.
 
-    They may be the corners of something nearer, of which the image shows no more.
+    They may be the corners of something nearer that lies mostly outside of the image.
     """
     border = np.ones(labels.shape, bool)
     border[BESIDE:-BESIDE, BESIDE:-BESIDE] = False
@@ -338,7 +339,7 @@ def _apart_in_height(
 def over_footprint(
     points: Float[np.ndarray, "n 3"], body: Float[np.ndarray, "m 3"], floor: Plane
 ) -> Bool[np.ndarray, " n"]:
-    """Whether points lie above the convex footprint, a little grown, of a body on the floor.
+    """Whether points lie above the slightly enlarged convex footprint of a body on the floor.
 
     A body hides its own far side, so the footprint is made as deep as it is wide.
     """

@@ -19,7 +19,7 @@ def doubts_of(
 ) -> list[Doubt]:
     """Evidence for and against a segmentation.
 
-    What was clicked on need not be seen to stand on a floor: its feet may be out of sight.
+    An object that was clicked on need not visibly stand on a floor: its feet may be out of sight.
 
     Args:
         segmented: Pixels that were segmented.
@@ -47,7 +47,7 @@ def falling(value: float, sure: float, unsure: float) -> float:
 def _outline(
     segmented: Bool[np.ndarray, "h w"], behind: Bool[np.ndarray, "h w"], view: Scene
 ) -> tuple[float, float]:
-    """Shares of the outline at which something nearer begins, and at which the surface goes on."""
+    """Shares of the outline at which a nearer surface begins, and where the surface continues."""
     nearer = touching = total = 0
     for turn in range(4):
         z, inside, back = (np.rot90(image, turn) for image in (view.z, segmented, behind))

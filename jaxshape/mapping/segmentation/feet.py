@@ -12,7 +12,7 @@ from jaxshape.mapping.segmentation.clusters import Scene, over_footprint
 from jaxshape.mapping.segmentation.planes import Plane, height_above, subsample
 
 SEPARABLE = 0.95
-"""Colours tell the object from the floor if they put this share of known pixels where they are."""
+"""Least share of known pixels that colours must classify correctly to tell object from floor."""
 
 
 def feet_on(
@@ -49,7 +49,7 @@ def _looks_like(
 ) -> Bool[np.ndarray, " n"]:
     """Whether most of the known pixels nearest in colour to each doubtful one are ours.
 
-    False for all where the same question, asked of the known pixels, gets too many wrong answers.
+    False for all if the same rule classifies too many of the known pixels wrongly.
     """
     rng = np.random.default_rng(0)
     known = [subsample(lab[pixels], 1000, rng) for pixels in (ours, others)]

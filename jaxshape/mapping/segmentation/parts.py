@@ -1,4 +1,4 @@
-"""Parts that a depth frame falls into, and the floor in it: all that later decisions need. [host]
+"""Parts and floor of a depth frame: all the data that later decisions need. [host]
 
 Finding them costs most of the time of a segmentation, and depends on the frame alone. Which parts
 are the object is decided again and again, as other frames are seen (`belonging`).
@@ -23,10 +23,10 @@ class Parts(NamedTuple):
 
     Attributes:
         labels: Cluster of each pixel, from 1; 0 on floor, walls and table tops, and where nothing
-            was measured; `SPECK` on what is none of these and too small for a cluster `[h w]`.
+            was measured; `SPECK` on other pieces that are too small for a cluster `[h w]`.
         sure: True on pixels that are known to show the object `[h w]`.
-        corners: Labels of the clusters that may be corners of something nearer, of which the image
-            shows no more `[n]`.
+        corners: Labels of the clusters that may be corners of something nearer, the rest of which
+            lies outside of the image `[n]`.
         tops: Number of the table top of each pixel, from 1; 0 elsewhere `[h w]`.
         pairs: Pairs of labels of clusters that belong together in this frame `[m 2]`.
         floor: Normal of the floor, towards the camera, and the height of the camera above it in

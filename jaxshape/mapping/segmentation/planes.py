@@ -16,19 +16,21 @@ from jaxshape.geometry import camera
 from jaxshape.geometry.sensor import tolerance
 
 SAMPLE = 4000
-"""Points among which planes are sought: enough for a plane that holds a fiftieth of them."""
+"""Number of points in which planes are searched: enough for a plane that holds 2 % of them."""
 
 HYPOTHESES = 256
 """Planes tried, all at once, each through a few neighbouring points."""
 
 NEIGHBOURS = 24
-"""Points that a hypothesis is fitted to: half a metre of a wall three metres away."""
+"""Number of points that a hypothesis is fitted to: they span half a metre of a wall at three
+metres."""
 
 REFINED = 6
-"""Hypotheses that are refined, those with most inliers: the first may lie across a corner."""
+"""Number of hypotheses with most inliers that are refined: the best one may lie across a corner."""
 
 MAX_TILT = 65.0
-"""Largest angle, in degrees, between the floor's normal and up in the image of a camera in hand."""
+"""Largest angle, in degrees, between the floor's normal and up in the image of a hand-held
+camera."""
 
 WALL = 0.05
 """Least share of the points that a wall holds."""
@@ -90,9 +92,10 @@ def dominant_planes(
 ) -> list[Plane]:
     """The planes that hold most points, one after the other, by RANSAC; largest first.
 
-    Each plane takes its points away from those after it; at most `count` planes that hold at least
-    `min_share` of all points are returned, so none for a cloud without planes or with fewer than
-    `NEIGHBOURS` points. The same points, in the same order, give the same planes.
+    The points of each plane are removed before the next plane is searched. At most `count` planes
+    that hold at least `min_share` of all points are returned, and none for a cloud without planes
+    or with fewer than `NEIGHBOURS` points. The same points, in the same order, give the same
+    planes.
     """
     rng = np.random.default_rng(seed)
     sample = subsample(points[np.isfinite(points).all(axis=-1)], SAMPLE, rng)
@@ -127,7 +130,8 @@ def _hypotheses(
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
     """Planes through the neighbours of random points, which mostly lie on one surface.
 
-    Three points from anywhere would share a plane that holds a tenth of all once in a thousand.
+    Three points drawn from the whole cloud would all lie on a plane that holds a tenth of the
+    points in only one of a thousand draws.
     """
     anchors = rng.choice(len(points), min(HYPOTHESES, len(points)), replace=False)
     _, near = KDTree(points).query(points[anchors], k=NEIGHBOURS)
@@ -146,7 +150,7 @@ def _refined(
     for _ in range(10):
         if inlier.sum() < 3:
             break
-        # Not its square, as exact for noise alone, or a few strays nearby would turn a far wall.
+        # The square would be exact for pure noise, but a few near strays would turn a far wall.
         certainty = inlier / tolerance(points[:, 2])
         normals, offsets = _fit(points[None], certainty[None])
         plane = Plane(normals[0], float(offsets[0]), float(inlier.mean()))
@@ -180,9 +184,10 @@ def floor_plane(
 ) -> Floor | None:
     """The floor among the planes of a view, or None where no plane can be it.
 
-    A floor is roughly horizontal for a camera held by hand, has next to nothing below it, as a
-    table top or a seat has, and the object, if its points are given, stands on it. Of several, the
-    most certain. Where only a table top is seen its normal is still up, and the certainty small.
+    A floor is roughly horizontal for a hand-held camera and, unlike a table top or a seat, has next
+    to nothing below it. The object, if its points are given, stands on it. Of several planes, the
+    most certain one is the floor. If only a table top is seen, its normal still points up, and the
+    certainty is small.
     """
     rng = np.random.default_rng(0)
     sample = subsample(points[np.isfinite(points).all(axis=-1)], SAMPLE, rng)
@@ -219,9 +224,9 @@ def nothing_below(plane: Plane, points: Float[np.ndarray, "n 3"]) -> float:
 def along_walls(planes: list[Plane]) -> Float[np.ndarray, " 3"] | None:
     """The vertical of a room whose floor is not seen: the direction that lies in two of its walls.
 
-    Any two large planes that meet at about a right angle count as walls where the line along which
-    they meet is roughly upright in the image of a camera in hand. Of several pairs, the one whose
-    smaller wall holds most points.
+    Any two large planes that meet at about a right angle count as walls if their line of
+    intersection is roughly upright in the image of a hand-held camera. Of several pairs, the one
+    whose smaller wall holds most points is used.
 
     Args:
         planes: Planes of the view, as `dominant_planes` finds them.

@@ -17,12 +17,12 @@ from jaxshape.mapping.segmentation.clusters import (
 
 
 class Proposal(NamedTuple):
-    """What may be an object: clusters of a frame that belong together.
+    """A possible object: clusters of a frame that belong together.
 
     Attributes:
         segmented: True on the pixels that show it `[h w]`.
-        size: Width, height and depth of what is seen of it `[3]`, in metres: upright where the
-            floor is seen, else along the axes of the camera.
+        size: Width, height and depth of its visible part `[3]`, in metres: upright where the floor
+            is seen, else along the axes of the camera.
         distance: Median depth, in metres.
     """
 
@@ -32,9 +32,9 @@ class Proposal(NamedTuple):
 
 
 def propose(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> tuple[Proposal, ...]:
-    """Find what stands in a frame before floor, walls and on table tops, the largest first.
+    """Find the objects in front of floor and walls and on table tops, the largest first.
 
-    The object of number i, from 1, is what `segment` takes with `Prompt(number=i)`.
+    `segment` takes the object of number i, from 1, with `Prompt(number=i)`.
 
     Args:
         depth: Depth image `[h w]`, in metres; 0 or infinite where nothing was measured.

@@ -1,9 +1,10 @@
 """Segmentation of the object in a depth frame (paper, sections 3.1 and 4.2). [host]
 
 The paper thresholds depth by hand. Here the floor, the walls and table tops are taken out as
-planes; the rest falls apart into clusters where depth jumps; the cluster in the middle, or under a
-click, is the object; pieces that other parts of it cut off are joined where they stand on the same
-footprint; and its feet, which depth cannot tell from the floor, are found by their colour.
+planes; the rest is split into clusters where depth jumps; the cluster in the middle, or under a
+click, is the object; pieces that other parts of the object separate from it are joined where they
+stand on the same footprint; and its feet, which depth cannot tell from the floor, are found by
+their colour.
 """
 
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ CLICK_RADIUS = 4.0
 """Radius around a click in which the object may lie, in pixels of the reduced image."""
 
 CANDIDATES = 5
-"""Clusters that are joined with what belongs to them before one is chosen."""
+"""Number of clusters that are joined with clusters that belong to them before one is chosen."""
 
 
 class Segmentation(NamedTuple):
@@ -235,9 +236,9 @@ def _most_central(
 ) -> tuple[list[int], Doubt]:
     """The cluster, with what belongs to it, that has the highest worth.
 
-    Pixels count by a Gaussian window about the target. Their sum is divided by the square root of
-    their number, so that what fills the image is worth little, and reduced where the border of the
-    image cuts the cluster.
+    Pixels are weighted by a Gaussian window about the target. The sum of the weights is divided by
+    the square root of the number of pixels, so that a cluster that fills the image is worth little,
+    and reduced where the border of the image cuts the cluster.
     """
     row, column = np.indices(labels.shape)
     away = np.hypot(row - target[0], column - target[1]) / (0.2 * labels.shape[1])

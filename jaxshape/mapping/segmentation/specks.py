@@ -1,7 +1,7 @@
-"""Thin parts, of which single frames show specks, confirmed by other frames. [host]
+"""Thin parts, which appear as specks in single frames, confirmed by other frames. [host]
 
-A leg two pixels wide falls into pieces too small for clusters, and so does noise. What several
-frames show in the same place, and what is connected there with the object, belongs to it.
+A leg two pixels wide falls into pieces too small for clusters, and so does noise. Specks that
+several frames show in the same place, connected with the object, belong to it.
 """
 
 import numpy as np

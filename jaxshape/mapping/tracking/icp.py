@@ -1,8 +1,8 @@
 """Iterated closest points, point to plane (paper, section 3.4; Besl and McKay, 1992; Chen and
 Medioni, 1992).
 
-What is aligned are the oriented points of one frame; what they are aligned with is a function that
-finds a match for each of them (`match_view`, `surfels.match_surface`), so that the same loop serves
+The oriented points of one frame are aligned with a reference. The reference is a function that
+finds a match for each point (`match_view`, `surfels.match_surface`), so that the same loop serves
 an earlier frame, the surface of the map, and both together (`match_all`).
 
     align   damped Gauss-Newton steps with robust weights until a step is below a tenth of a
@@ -28,8 +28,8 @@ CUTOFF = 4.0
 AGREEING = 0.7
 """Least cosine between the normals of a point and its match."""
 
-_SMALLEST_STEP = 1e-4  # metres, of the points' centre or by rotation at their rms distance
-_DAMPING = 1e-3  # of the largest eigenvalue: directions weaker than that are left alone
+_SMALLEST_STEP = 1e-4  # metres: motion of the points' centre, or of points at rms distance from it
+_DAMPING = 1e-3  # share of the largest eigenvalue: weaker directions are left alone
 
 
 class Cloud(NamedTuple):
@@ -55,8 +55,8 @@ class Matches(NamedTuple):
         normals: Unit normals of the surface there.
         deviation: Standard deviation of the place along its normal, in metres; infinite for no
             match.
-        in_reach: Whether the reference looked at the place where the point lies, so that it should
-            have a match.
+        in_reach: Whether the reference observed the place where the point lies, so that the point
+            should have a match.
     """
 
     points: Float[Array, "*references n 3"]
@@ -74,8 +74,8 @@ class Alignment(NamedTuple):
 
     Attributes:
         T_reference_source: Pose of the cloud in the reference frame.
-        inlier_fraction: Share of the points that the references should show that agree with them,
-            from 0 to 1.
+        inlier_fraction: Share of points that agree with the references, among the points that the
+            references should show, from 0 to 1.
         overlap: Share of all points that the references should show, from 0 to 1.
         rmse: Root mean square distance of inliers to the planes of their matches, in metres.
         information: Inverse covariance of the pose `[6 6]`, over translation and rotation about the
@@ -99,7 +99,7 @@ class Alignment(NamedTuple):
 def cloud_of(
     view: DepthView, segmented: Bool[Array, "h w"] | None = None, stride: int = 1
 ) -> Cloud:
-    """The oriented points of every `stride`-th pixel, of those segmented if that is given."""
+    """The oriented points of every `stride`-th pixel; only of segmented pixels if given."""
     known = is_oriented(view) if segmented is None else is_oriented(view) & segmented
     points, normals, known = (
         x[stride // 2 :: stride, stride // 2 :: stride] for x in (view.points, view.normals, known)
@@ -109,10 +109,10 @@ def cloud_of(
 
 
 def match_view(view: DepthView, T_reference_camera: jaxlie.SE3) -> Match:
-    """Match points with what a view shows at the pixel into which they fall.
+    """Match points with the surface that a view shows at the pixel to which they project.
 
     A point in front of the view's surface, or where its rays met nothing, should have been seen;
-    one behind that surface need not.
+    a point behind that surface may be hidden.
     """
     shown = jnp.concatenate([view.points, view.normals, view.depth[..., None]], axis=-1)
     R, t = T_reference_camera.rotation().as_matrix(), T_reference_camera.translation()
@@ -201,8 +201,8 @@ class _System(NamedTuple):
         gradient: Right side of the equations, with opposite sign `[6]`.
         center: Point about which the cloud is rotated, the weighted mean of its points, in metres.
         radius: Root mean square distance of the points from the centre, in metres.
-        inliers: Points that agree with a match.
-        in_reach: Points that should have a match.
+        inliers: Number of points that agree with a match.
+        in_reach: Number of points that should have a match.
         rmse: Root mean square distance of inliers to the planes of their matches, in metres.
     """
 
@@ -253,7 +253,7 @@ def robust_weight(
 
 
 def _solve(system: _System) -> tuple[jaxlie.SE3, Float[Array, ""]]:
-    """The motion that the equations ask for, and its length; motions they leave free are zero."""
+    """The motion that solves the equations, and its length; undetermined motions are zero."""
     eigenvalues, axes = jnp.linalg.eigh(system.hessian)
     floor = _DAMPING * jnp.maximum(eigenvalues[-1], 1e-6)  # its square is not 0 without matches
     inverse = eigenvalues / (eigenvalues**2 + floor**2)

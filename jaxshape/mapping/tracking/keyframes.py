@@ -47,7 +47,7 @@ class PreparedFrame(NamedTuple):
         view: Depth image at working size, with its oriented points.
         masked: Pixels that may show the object `[h w]`: a given mask, or all.
         recorded: The depth image in full size; None where that is the working size.
-        parts: Parts that the image falls into; None where the box alone tells the object.
+        parts: Parts that the image falls into; None where the box alone defines the object.
         instances: Number of the object that each pixel shows `[h w]`, 0 for none; None where no
             mask numbers them.
     """
@@ -78,7 +78,7 @@ class Keyframe(NamedTuple):
         information: Inverse covariance of that relative pose `[6 6]`, in the frame of the keyframe
             before; 0 for the first.
         recorded: The depth image in full size, which is fused; None where that is the working size.
-        parts: Parts that the image falls into; None where the box alone tells the object.
+        parts: Parts that the image falls into; None where the box alone defines the object.
     """
 
     depth: Float[Array, "h w"]

@@ -47,7 +47,7 @@ def register(
 def agreement(
     view: DepthView, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
 ) -> Alignment:
-    """How well the segmented pixels of a view agree with a reference at a pose, as it is."""
+    """How well the segmented pixels of a view agree with a reference at a fixed pose."""
     finest = LEVELS[-1]._replace(iterations=0)
     return _descend(view, segmented, match, T_reference_camera, (finest,))
 
@@ -55,7 +55,7 @@ def agreement(
 def register_from(
     view: DepthView, segmented: Bool[Array, "h w"], match: Match, T_reference_camera: jaxlie.SE3
 ) -> Alignment:
-    """Align a view from many guesses, a batch of poses; the one that explains most goes on."""
+    """Align a view from many guesses, a batch of poses; the best coarse result is refined."""
     coarse = LEVELS[0]
     rough = jax.vmap(lambda T: _descend(view, segmented, match, T, (coarse,)))(T_reference_camera)
     best = jnp.argmax(score(rough))
@@ -86,10 +86,10 @@ def _descend(view, segmented, match, T, levels) -> Alignment:
 def guesses(
     T_world_camera: jaxlie.SE3, center: Float[Array, " 3"], count: int = 24, reach: float = 40.0
 ) -> jaxlie.SE3:
-    """A batch of poses around one: itself first, then turned about a world point.
+    """A batch of poses around one: the pose itself, then the pose turned about a world point.
 
-    Turned by up to `reach` degrees about the image's vertical axis, as by walking around, and a
-    third of that about the horizontal one.
+    Turns are up to `reach` degrees about the image's vertical axis, as by walking around the point,
+    and a third of that about the horizontal axis.
     """
     angle = jnp.deg2rad(reach) * jnp.linspace(-1, 1, count // 3)
     yaw, pitch = jnp.meshgrid(angle, jnp.deg2rad(reach / 3) * jnp.array([0.0, 1.0, -1.0]))

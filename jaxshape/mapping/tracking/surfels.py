@@ -1,9 +1,9 @@
 """The surface of the map as small oriented patches, one for each cell of a grid.
 
-Patches of two sources have one form. Measured patches are averages of what keyframes measured in
-each cell, exact to a fraction of a millimetre; predicted patches lie in the middle of the decoded
-shell, exact to a fraction of a voxel. Their standard deviations say so, and are the weights of
-whatever is aligned with the surface.
+Patches from two sources have the same form. Measured patches are averages of the points that
+keyframes measured in each cell, exact to a fraction of a millimetre; predicted patches lie in the
+middle of the decoded shell, exact to a fraction of a voxel. Their standard deviations express this,
+and give the weights of points that are aligned with the surface.
 """
 
 from itertools import product
@@ -20,14 +20,14 @@ CELLS = 64
 """Cells along each axis: some 1.5 cm on a chair."""
 
 FLAT = 0.8
-"""Least length of a cell's mean normal: below, several faces share the cell."""
+"""Least length of a cell's mean normal: if it is shorter, several faces share the cell."""
 
 PREDICTED_DEVIATION = 0.35
 """Standard deviation of the predicted surface, in voxels of the decoded grid."""
 
-_MEASURED_DEVIATION = 0.05  # in cells: what a plane leaves of the surface inside one
+_MEASURED_DEVIATION = 0.05  # in cells: deviation of the surface in a cell from a plane
 _REACH = 3  # cells within which points find a patch
-_PATCHES_BY_FACE = 4  # of a predicted surface at most, by voxels of a face of the grid
+_PATCHES_BY_FACE = 4  # most patches of a predicted surface, per voxel of one face of the grid
 
 
 class Lattice(NamedTuple):
@@ -75,7 +75,7 @@ def cell_size(lattice: Lattice) -> Float[Array, ""]:
 
 
 class Sums(NamedTuple):
-    """Sums of measured points in each cell; sums of sums are sums.
+    """Sums of measured points in each cell; two of them can be added.
 
     Attributes:
         weight: Sum of inverse variances, per square metre.
@@ -99,10 +99,10 @@ def add_up(
     normals: Float[Array, "n 3"],
     deviation: Float[Array, " n"],
 ) -> Sums:
-    """Sum world points, which are infinitely uncertain where there are none, over cells."""
+    """Sum world points over cells; missing points have infinite standard deviation."""
     index = jnp.where(jnp.isfinite(deviation), cell_of(lattice, points), CELLS**3)
     weight = 1 / deviation**2
-    # From the centres, as sums of world coordinates would lose the millimetres.
+    # Relative to the centres: sums of world coordinates would lose the millimetres.
     offset = points - cell_centers(lattice, index)
     values = weight[:, None] * jnp.concatenate([jnp.ones_like(points[:, :1]), offset, normals], 1)
     values = jnp.where(jnp.isfinite(deviation)[:, None], values, 0)
@@ -138,9 +138,9 @@ def measured_surface(lattice: Lattice, sums: Sums) -> Surface:
 def predicted_surface(lattice: Lattice, completed: Float[Array, "x y z"]) -> Surface:
     """The middle of a shell of probabilities on the voxel grid.
 
-    A patch lies at the mean of the probable voxels around a probable voxel, its normal along the
-    axis in which they spread least; voxels around which they spread alike in all directions, as at
-    the end of a leg, have no patch.
+    A patch lies at the mean of the probable voxels around a probable voxel; its normal is the axis
+    along which they spread least. Where they spread alike in all directions, as at the end of a
+    leg, there is no patch.
     """
     solid = jnp.where(completed > 0.5, completed, 0)
     mean, spread = _neighbourhoods(solid)
@@ -198,7 +198,7 @@ def match_surface(surface: Surface) -> Match:
         agreement = jnp.where(found[:, 7] > 0, jnp.abs(cosine), cosine)
         near = jnp.sum((points - q) ** 2, axis=-1) < distance**2
         fits = (index < CELLS**3) & near & (agreement > AGREEING)
-        # What the map does not hold may be new: nothing should have been shown.
+        # Points without a patch may be new surface, so no point is expected to have a match.
         return Matches(q, n, jnp.where(fits, deviation, jnp.inf), jnp.zeros_like(fits))
 
     return match
@@ -207,7 +207,7 @@ def match_surface(surface: Surface) -> Match:
 def _neighbourhoods(
     solid: Float[Array, "x y z"],
 ) -> tuple[Float[Array, "c 3"], Float[Array, "c 3 3"]]:
-    """Mean position and spread, in voxels, of what fills the 3^3 voxels around each voxel."""
+    """Mean position and spread, in voxels, of the solid among the 3^3 voxels around each voxel."""
     n, steps = len(solid), list(product((-1, 0, 1), repeat=3))
     padded, offsets = jnp.pad(solid, 1), jnp.array(steps, jnp.float32)
     around = jnp.stack(

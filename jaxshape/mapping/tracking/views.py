@@ -1,7 +1,7 @@
-"""A depth image as oriented points: what tracking aligns.
+"""A depth image as oriented points, which tracking aligns.
 
-Points and normals are those of the image after an edge-preserving smoothing, for the raw pixels of
-a structured-light sensor say little about the direction of a surface.
+Points and normals come from the image after edge-preserving smoothing, because the raw pixels of a
+structured-light sensor say little about the direction of a surface.
 """
 
 from typing import NamedTuple
@@ -14,9 +14,9 @@ from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.sensor import depth_deviation
 
 JUMP = 0.03
-"""Neighbouring pixels whose depths differ by more than this share of it lie on two surfaces."""
+"""Neighbouring pixels lie on two surfaces if their depths differ by more than this share."""
 
-_TAPS = (0.06, 0.25, 0.38, 0.25, 0.06)  # of the smoothing, along each axis
+_TAPS = (0.06, 0.25, 0.38, 0.25, 0.06)  # weights of the smoothing along each axis
 
 
 class DepthView(NamedTuple):
@@ -26,7 +26,7 @@ class DepthView(NamedTuple):
         depth: Depth as measured `[h w]`, in metres; 0 where nothing is known, infinite where the
             ray met nothing.
         points: Points of the smoothed depth image `[h w 3]`, in metres.
-        normals: Unit normals towards the camera `[h w 3]`; 0 where the image does not tell.
+        normals: Unit normals towards the camera `[h w 3]`; 0 where they are not known.
         intrinsics: The camera.
     """
 
@@ -70,9 +70,10 @@ def halved(
 
 
 def _smooth_rows(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Mean of the pixels around each on its row, those of other surfaces left out.
+    """Weighted mean around each pixel in its row, without pixels of other surfaces.
 
-    A pixel counts no more than the one opposite: at the end of a slope the mean would lie off it.
+    A neighbour counts no more than the one opposite: otherwise, at the end of a slope, the mean
+    would lie off the slope.
     """
     scale = 3 * depth_deviation(depth) + JUMP / 3 * depth
     padded = jnp.pad(depth, ((0, 0), (2, 2)))

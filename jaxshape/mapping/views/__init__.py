@@ -1,1 +1,1 @@
-"""Where a camera should look next: candidates, what each would see, and what that would tell."""
+"""Where a camera should look next: candidate views, their visible voxels and information gain."""

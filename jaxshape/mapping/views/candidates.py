@@ -1,4 +1,4 @@
-"""Cameras that a person can hold around an object, and where they are in words.
+"""Cameras that a person can hold around an object, and their positions in words.
 
 They lie on a sphere around the object and look at its centre. Azimuth is 0 in front of the object,
 +z, and grows towards its left side, +x: left as someone sees it who sits on the chair.

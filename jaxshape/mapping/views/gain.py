@@ -1,15 +1,15 @@
-"""How much each of many cameras would tell about an object: the expected drop in entropy.
+"""Information gain of each of many cameras for an object: the expected drop in entropy.
 
-What is not known of an object are its occluded voxels. Samples of its shape say how uncertain each
-is, by its entropy H under the mean of the samples, and in how many of the shapes a camera would see
-it past what hides it there. The expected drop of a camera is
+The unknown part of an object is its occluded voxels. Samples of its shape give the uncertainty of
+each voxel, its entropy H under the mean of the samples. They also give the share of shapes in which
+a camera would see the voxel without occlusion. The expected drop of a camera is
 
     sum_v  H_v r_v        with r_v the share of voxel v that the camera settles,
 
 where r_v is the probability that v is seen, times the certainty with which the sensor tells a voxel
-at that distance. That what is seen also tells of what varies with it over the samples, of the other
-legs, was tried (the voxels as jointly normal, with the covariance of the samples): it chose views
-that were no better (docs/next_view.md).
+from its neighbours at that distance. A variant was tried in which seen voxels also inform voxels
+that vary with them over the samples, such as the other legs (voxels as jointly normal, with the
+covariance of the samples): it chose views that were no better (docs/next_view.md).
 """
 
 from typing import NamedTuple
@@ -28,20 +28,20 @@ from jaxshape.mapping.views.seeing import MOST_SHAPES, hidden, pack, share
 from jaxshape.search.composition import compose
 
 VOXELS = 1024
-"""Voxels that are asked about, drawn in proportion to their entropy: gains err by 2 % then."""
+"""Number of voxels that are evaluated, drawn in proportion to their entropy: gains err by 2 %."""
 
 TURNING = 0.05
-"""What walking half round the object costs, as a share of the greatest gain: of cameras that tell
-as much within the error of the gain, the nearer one comes first."""
+"""Cost of walking half round the object, as a share of the greatest gain: among cameras whose gains
+are equal within their error, the nearer one comes first."""
 
 
 class NextViews(NamedTuple):
-    """Cameras, by what they would tell.
+    """Cameras, ranked by their expected information gain.
 
     Attributes:
         T_object_camera: Pose of each camera in the object frame `[view]`.
         gain: Expected drop in the entropy of the occluded voxels `[view]`, in nats, 0 or more.
-        score: The gain less the cost of the way to the camera `[view]`, in nats.
+        score: The gain minus the cost of the way to the camera `[view]`, in nats.
         ranking: Numbers of the cameras, the best first `[view]`.
         entropy: Entropy of the occluded voxels before, in nats.
     """
@@ -74,7 +74,7 @@ def next_views(
         frame: Voxel frame of the grids.
         T_object_camera: Poses of the cameras to choose from, outside the object's box `[view]`.
         intrinsics: Focal lengths and principal point of the cameras, in pixels.
-        shape: Height and width of its images, in pixels.
+        shape: Height and width of their images, in pixels.
         here: Where the camera is now, in the object frame `[3]`, in metres; nearby cameras come
             first where gains are about the same. None where that does not matter.
         sensor: How the noise of depth grows with distance.
@@ -122,7 +122,7 @@ def _gains(samples, grids, frame, T_object_camera, intrinsics, shape, sensor):
 
 
 def _entropy(p: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Entropy of something that is so with probability p, in nats."""
+    """Entropy of an event with probability p, in nats."""
     return -xlogy(p, p) - xlogy(1 - p, 1 - p)
 
 
@@ -134,7 +134,7 @@ def _drawn(weight: Float[Array, " n"]) -> tuple[Int[Array, " k"], Float[Array, "
 
 
 def _certainty(points, T_object_camera, intrinsics, shape, frame, sensor) -> Float[Array, "v k"]:
-    """How surely the sensor tells points from their neighbours; 0 outside the image."""
+    """Certainty with which the sensor tells points from their neighbours; 0 outside the image."""
     seen = jax.vmap(transform, in_axes=(0, None))(T_object_camera.inverse(), points)
     pixels, depth = project(intrinsics, seen)
     inside = (pixels >= 0) & (pixels < jnp.array(shape[::-1]))
@@ -144,7 +144,7 @@ def _certainty(points, T_object_camera, intrinsics, shape, frame, sensor) -> Flo
 
 
 def _cost(eyes: Float[Array, "view 3"], here: Float[Array, " 3"] | None) -> Float[Array, " view"]:
-    """The angle from where the camera is, as a share of half a turn."""
+    """The angle from the present camera position, as a share of half a turn."""
     if here is None:
         return jnp.zeros(len(eyes))
     length = jnp.linalg.norm(eyes, axis=1) * jnp.linalg.norm(here)

@@ -1,8 +1,8 @@
-"""Which voxels a camera would see of each of many plausible shapes at once.
+"""Visibility of voxels from cameras, for many plausible shapes at once.
 
-Shapes travel as bits: bit s of a voxel's number is set where shape s is occupied, so that one
-look-up serves all shapes. From each voxel that is asked about, a ray goes to the camera, one voxel
-at a time along its longest axis; what is occupied on the way hides the voxel.
+Shapes are stored as bits: bit s of a voxel's number is set where shape s is occupied, so that one
+look-up serves all shapes. A ray goes from each queried voxel to the camera, one voxel at a time
+along its longest axis; an occupied voxel on the way hides the queried one.
 """
 
 import jax
@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from jaxshape.geometry.grid import flat_index
 
 MOST_SHAPES = 32
-"""Shapes that the bits of a number hold."""
+"""Largest number of shapes, one for each bit of a number."""
 
 
 def pack(occupied: Bool[Array, "sample x y z"]) -> UInt32[Array, " voxel"]:
@@ -41,7 +41,7 @@ def hidden(
     Args:
         packed: The shapes, from `pack`.
         resolution: Voxels along each axis of the grid.
-        voxels: Indices of the voxels asked about `[k 3]`.
+        voxels: Indices of the queried voxels `[k 3]`.
         eyes: Positions of the cameras in voxel coordinates `[view 3]`, outside the grid.
     """
     center = voxels + 0.5
