@@ -29,7 +29,7 @@ STATE = "state.npz"
 
 
 def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> None:
-    """Keep what a later run with the same settings needs to go on from here.
+    """Keep all data that a later run with the same settings needs to go on from here.
 
     Args:
         folder: The result folder.
@@ -66,7 +66,7 @@ def save_state(folder: Path, progress: Progress, settings: dict[str, Any]) -> No
         poses = [getattr(one, name).wxyz_xyz for one in state.keyframes]
         arrays[f"keyframes.{name}"] = np.stack(poses)
     arrays["keyframes.information"] = np.stack([one.information for one in state.keyframes])
-    # Which pixels they are depended on poses and boxes that are no more.
+    # These pixels depended on poses and boxes that no longer exist.
     for name in ("masked", "segmented"):
         pixels = np.stack([np.asarray(getattr(one, name)) for one in state.keyframes])
         arrays[f"keyframes.{name}"] = np.packbits(pixels, axis=-1)

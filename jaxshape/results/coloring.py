@@ -17,24 +17,26 @@ from scipy.spatial import KDTree
 from jaxshape.geometry.pixels import Sensor
 
 NEUTRAL = (201, 192, 177)
-"""Grey-beige: the colour of what no frame shows."""
+"""Grey-beige: the colour of vertices that no frame shows."""
 
 BLENDED = 3
-"""Frames that give a vertex its colour, at most; each fades out before another takes its place."""
+"""Largest number of frames that give a vertex its colour; each fades out before another takes its
+place."""
 
 FADE = 24.0
-"""Pixels from the border of an image over which a frame counts less and less."""
+"""Distance from the border of an image, in pixels, over which the weight of a frame falls to 0."""
 
 BLED, EDGE = 2.0, 8.0
-"""Pixels from a depth jump within which colours may be those of the other surface, for depth and
-colour are never registered exactly; and from where on they count in full."""
+"""Distances from a depth jump, in pixels. Within the first, colours may belong to the other
+surface, because depth and colour are never registered exactly; from the second on, colours count in
+full."""
 
 DOUBTFUL = 1e-6
-"""Factor of colours that may be those of the other surface: they count where there is nothing else,
-not even a colour nearby."""
+"""Weight of colours that may belong to the other surface: they count only where there is no other
+colour, not even nearby."""
 
 JUMP = 0.03
-"""Neighbouring pixels whose depths differ by more than this share of it lie on two surfaces."""
+"""Neighbouring pixels lie on two surfaces if their depths differ by more than this share."""
 
 
 class ColorView(NamedTuple):
@@ -68,8 +70,8 @@ def color_vertices(
         mesh: Mesh in the object frame, in metres.
         measured: True for vertices on the measured surface; the others are neutral.
         views: Frames that may show it.
-        reach: Metres over which measured vertices that no frame shows take over a colour nearby,
-            and a quarter of which a depth may differ beyond the sensor's noise.
+        reach: Distance in metres over which measured vertices that no frame shows take over a
+            nearby colour. Depths may differ by a quarter of it beyond the sensor's noise.
         sensor: Noise of the camera's depth.
 
     Returns:
@@ -122,7 +124,7 @@ def _shown(
 
 
 def _from_jumps(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Pixels from each pixel to the nearest that is next to a depth jump, or unknown."""
+    """Distance of each pixel, in pixels, to the nearest depth jump or unknown pixel."""
     known = np.where(np.isfinite(depth), depth, 1e3)
     low, high = ndimage.minimum_filter(known, 3), ndimage.maximum_filter(known, 3)
     is_smooth = np.pad(high - low < JUMP * known, 1, constant_values=True)
@@ -134,8 +136,8 @@ def _from_jumps(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 def _blended(
     quality: Float[np.ndarray, "k n"], colors: Float[np.ndarray, "k n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Mean colour of the best frames. The worst of them does not count, so that none appears at
-    once from one vertex to the next."""
+    """Mean colour of the best frames. The worst of them has no weight, so that no frame appears
+    abruptly from one vertex to the next."""
     weight = (quality - quality.min(axis=0) + 1e-4 * quality + 1e-12) ** 2
     return np.einsum("kn,knd->nd", weight / weight.sum(axis=0), colors)
 
@@ -146,9 +148,9 @@ def _spread(
     quality: Float[np.ndarray, " n"],
     reach: float,
 ) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of all points: those in doubt take that of the nearest sure one, if it is near."""
+    """Colours of all points: doubtful ones take the colour of a sure point, if one is near."""
     found = np.where(quality[:, None] > 0, color, NEUTRAL)
-    sure = quality > 20 * DOUBTFUL  # a frame from less than 0.3 m is none
+    sure = quality > 20 * DOUBTFUL  # no frame is taken from less than 0.3 m
     if sure.any() and not sure.all():
         away, nearest = KDTree(points[sure]).query(points[~sure])
         near = np.asarray(away) < reach

@@ -13,8 +13,8 @@ def confidence_at(
 ) -> Float[np.ndarray, " n"]:
     """The probability that there is surface where each vertex is, from 0 to 1.
 
-    Vertices lie between voxels that are occupied and free ones, so that the most probable of the
-    eight voxels around a vertex counts.
+    Vertices lie between occupied and free voxels, so the result is the highest probability of the
+    eight voxels around a vertex.
 
     Args:
         vertices: Vertices in the object frame, in metres.

@@ -44,12 +44,12 @@ class EvaluateConfig(CameraConfig):
         frames: Numbers of frames to fuse, each 1 or more: the first k of the orbit.
         methods: Names of the searches, see `jaxshape.search.methods`; "encoder" searches nothing.
         camera: Name of the depth camera, see `jaxshape.data.virtual_cameras`.
-        noise: Give the depth images the faults of the camera's sensor; None for all but the paper's
-            camera.
+        noise: Give the depth images the faults of the camera's sensor; None gives them to all
+            cameras except the paper's.
         fusion: Method that turns frames into F and M, "distance" or "points"; None for points where
             the paper's camera has no noise, distances elsewhere.
-        ceiling: Add to the bounds the best that the space could hold, `fit_surface`, whatever was
-            seen.
+        ceiling: Add to the bounds the best shape that the code space can hold (`fit_surface`),
+            independent of the measurement.
         refine: Settings of the searches.
         seed: Seed of noise, surface samples and searches, 0 or more.
     """
@@ -88,7 +88,7 @@ def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) 
     """Fuse the first k frames of an orbit at 30 degrees elevation, for every k of the settings.
 
     Args:
-        model: The mesh, in metres; of no object's size, it is scaled to a diagonal of 1 m.
+        model: The mesh, in metres; if its size fits no object, it is scaled to a diagonal of 1 m.
         config: Settings of the evaluation.
         resolution: Voxels along each axis of the grids.
 
@@ -96,7 +96,7 @@ def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) 
         The grids; None where some number of frames measured nothing.
     """
     mesh, device = in_metres(model.mesh), virtual_camera(config.camera)
-    # Independent of the other meshes, so that a mesh scores the same in any company.
+    # Independent of the other meshes, so that the scores of a mesh do not depend on them.
     seed = hash_seed(config.seed, *model.name.encode())
     captured = capture(
         mesh,

@@ -1,7 +1,7 @@
 """The content of a result folder, as far as it is there, for the report and the viewer. [host]
 
-A folder may be old, half written, or rewritten at this moment: a file that is missing is left out,
-and of one that cannot be read, `problems` tells.
+A folder may be old, half written, or rewritten at this moment: missing files are left out, and
+`problems` names the files that cannot be read.
 """
 
 import os
@@ -190,7 +190,7 @@ def extent(found: ResultFolder) -> tuple[Float[np.ndarray, " 3"], float]:
 
 
 def half_field_of_view(found: ResultFolder) -> tuple[float, float]:
-    """Tangents of half the angle the camera sees across and down; a Kinect's where not known."""
+    """Tangents of half the horizontal and vertical field of view; of a Kinect where not known."""
     if found.intrinsics is None or found.shape is None:
         return 0.55, 0.41
     (fx, fy, *_), (h, w) = found.intrinsics, found.shape
@@ -274,8 +274,8 @@ def pose_of(value: Any) -> Float[np.ndarray, "4 4"] | None:
 
 
 def _stand_in(keyframes: list[KeyframeRecord], result: dict[str, Any]) -> tuple[Any, ...]:
-    """A frame to look from where there is no grid: that of a scene's first object, which stands
-    upright, or of the first camera, in which y points down."""
+    """A substitute for the object frame where there is no grid: the frame of a scene's first
+    object, which stands upright, or of the first camera, in which y points down."""
     objects = (pose_of(one.get("T_world_object")) for one in entries_of_objects(result))
     cameras = (k.T_world_camera for k in keyframes)
     upright = next((T for T in objects if T is not None), None)
@@ -288,7 +288,7 @@ def _stand_in(keyframes: list[KeyframeRecord], result: dict[str, Any]) -> tuple[
 def _segments(
     frames: list[dict[str, Any]], T_object_world: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "s 2 3"]:
-    """From each posed frame to the next; the path is broken where frames between were lost."""
+    """Segments from each posed frame to the next; the path is broken at lost frames."""
     poses = [pose_of(frame.get("T_world_camera")) for frame in frames]
     pairs = [
         (a[:3, 3], b[:3, 3])

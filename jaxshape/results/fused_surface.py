@@ -1,9 +1,9 @@
-"""One mesh of what was measured and what was decoded, at the resolution of the fine grid. [host]
+"""One mesh of the measured and the decoded surface, at the resolution of the fine grid. [host]
 
 The measured surface is where the fused signed distance changes its sign. Where nothing was
-measured, decoded logits stand for a distance. From the edge of what was measured its distance is
-carried on, and fades out over six fine voxels, so that both surfaces meet without a step; much
-sooner where it would go on as a fin into what the decoded shape leaves free.
+measured, decoded logits serve as distances. Beyond the edge of the measured surface, its distances
+continue and fade out over six fine voxels, so that both surfaces meet without a step. They fade out
+much sooner where they would form a fin in space that the decoded shape leaves free.
 """
 
 from functools import partial
@@ -21,29 +21,32 @@ from jaxshape.geometry.distance import DistanceField, mean_distance
 from jaxshape.geometry.grid import GridFrame
 
 REACH, FIN = 6.0, 1.6
-"""Fine voxels over which measured distances fade out beyond the edge of what was measured; and the
-same where they are solid and the decoded shape is free."""
+"""Number of fine voxels over which measured distances fade out beyond the edge of the measured
+surface; and the same number where they are solid and the decoded shape is free."""
 
 ROUNDS = 30
-"""Rounds of Taubin's filter, which take off the grain that the noise of few frames leaves. On CAD
-seats the measured surface gets more exact by it; averaging the distances themselves makes it less
-so, for it moves the sides of thin parts."""
+"""Number of rounds of Taubin's filter, which removes the grain that the noise of few frames leaves.
+On CAD seats it makes the measured surface more exact. Averaging the distances themselves makes the
+surface less exact, because this moves the sides of thin parts."""
 
 NATS = 0.25
-"""Logits at the decoded surface: above 0, for occupied voxels reach beyond what they hold."""
+"""Logit at the decoded surface: above 0, because occupied voxels reach beyond the surface in them.
+"""
 
 NATS_PER_VOXEL = 6.0
 """Slope of logits across a decoded surface."""
 
 DEEP = 1.5
-"""Fine voxels behind a surface down to which its distances are taken as they are."""
+"""Depth behind a surface, in fine voxels, down to which measured distances are trusted."""
 
 FAR, NEAR = 3.0, 0.5
-"""Fine voxels at which distances end, and within which a vertex lies on the measured surface."""
+"""Largest distance that is stored, and distance within which a vertex lies on the measured surface,
+in fine voxels."""
 
 LITTLE, LESS, AROUND = 0.03, 0.25, 7
-"""Weight at which a measured distance and the smooth surface around it count the same, and as a
-share of the greatest weight among so many fine voxels: edges are ragged where few frames agree."""
+"""Weight at which a measured distance counts as much as the smooth surface around it: the first
+value, or, if that is more, the second value as a share of the greatest weight in a cube with the
+third number of fine voxels per side. Edges are ragged where few frames agree."""
 
 CRUMB = 0.01
 """Share of the largest piece's area below which a loose piece is dropped wherever it lies."""
@@ -53,7 +56,7 @@ FLOOR = 1.0
 
 
 class FusedSurface(NamedTuple):
-    """A mesh, and where it comes from.
+    """A mesh, and the source of its vertices.
 
     Attributes:
         mesh: Mesh in the object frame, in metres; normals point outwards.
@@ -107,7 +110,7 @@ def fuse_surface(
 def combine(
     field: DistanceField, logits: Float[np.ndarray, "x y z"], voxel: float
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z"]]:
-    """Signed distances of the whole shape, and those that were measured.
+    """Signed distances of the whole shape, and the measured signed distances.
 
     Args:
         field: Field of one object.
@@ -115,7 +118,8 @@ def combine(
         voxel: Metres that count as 1 in the distances: the side of a fine voxel.
 
     Returns:
-        Distances at the centres of fine voxels, and those measured, far where none were.
+        Distances at the centres of fine voxels, and the measured ones, which are large where
+        nothing was measured.
     """
     resolution = len(logits)
     measured, trusted, free, seen_free = jax.device_get(_measured(field, resolution))
@@ -143,7 +147,7 @@ def _measured(field: DistanceField, resolution: int) -> tuple[Array, Array, Arra
 
 
 def _within_margin(trusted: Bool[np.ndarray, "X Y Z"], width: int) -> Bool[np.ndarray, "X Y Z"]:
-    """Nothing is trusted in the margin that the box leaves free, where only the floor is seen."""
+    """Trusted voxels, without the free margin of the box, in which only the floor is seen."""
     inner = slice(width, len(trusted) - width)
     kept = np.zeros_like(trusted)
     kept[inner, inner, inner] = trusted[inner, inner, inner]
@@ -164,7 +168,7 @@ def _carried_on(
     trusted: Bool[np.ndarray, "X Y Z"],
     decoded: Float[np.ndarray, "X Y Z"],
 ) -> Float[np.ndarray, "X Y Z"]:
-    """Measured distances that fade into decoded ones beyond the edge of what was measured."""
+    """Measured distances that fade into decoded ones beyond the edge of the measured surface."""
     nearest = np.asarray(
         ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     )
@@ -176,7 +180,7 @@ def _carried_on(
 
 
 def _upsample(coarse: Float[np.ndarray, "x y z"], scale: int) -> Float[np.ndarray, "X Y Z"]:
-    """Linear between voxel centres, constant beyond the outermost."""
+    """Upsample a grid: linear between voxel centres, constant beyond the outermost ones."""
     at = (np.arange(scale * len(coarse)) + 0.5) / scale - 0.5
     for axis in range(3):
         low = np.clip(np.floor(at).astype(int), 0, coarse.shape[axis] - 2)
@@ -201,7 +205,7 @@ def _filled(
 def _settled(
     mesh: trimesh.Trimesh, measured: Bool[np.ndarray, " n"], rounds: int = 4
 ) -> Bool[np.ndarray, " n"]:
-    """The flags of most of each vertex and its neighbours: no speckles across a border."""
+    """Flags by majority of each vertex and its neighbours, so that borders have no speckles."""
     one, other = mesh.edges.T
     count = np.bincount(one, minlength=len(measured)) + 1
     for _ in range(rounds):

@@ -37,7 +37,7 @@ class Journal:
         self.write({})
 
     def forget(self, contents: Mapping[str, str]) -> None:
-        """Leave out rows of another content, as of files that have changed since.
+        """Leave out rows that were made from other content, such as files that have changed.
 
         Args:
             contents: Digests by the names of rows; other rows stay.
@@ -75,7 +75,7 @@ class Share(NamedTuple):
     count: int = 1
 
     def of(self, items: Sequence[Any]) -> list[Any]:
-        """The entries that are this process's.
+        """The entries that belong to this process.
 
         Args:
             items: The list, the same for all processes.
@@ -83,7 +83,7 @@ class Share(NamedTuple):
         return list(items[self.index :: self.count])
 
     def journal(self, output: Path, settings: dict[str, Any]) -> Journal:
-        """The journal of this process beside a results file, until that is written.
+        """The journal of this process, beside a results file until that file is written.
 
         Args:
             output: The results file.
@@ -105,7 +105,7 @@ def journals_of(output: Path, settings: dict[str, Any]) -> list[Journal]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The content of a journal; `ValueError` if it is none."""
+    """The content of a journal; `ValueError` if the file is no journal."""
     try:
         content = reading.read_json_object(path)
         kinds = {"settings": dict, "rows": dict, "seconds": (int, float)}

@@ -21,10 +21,10 @@ from jaxshape.mapping.views.gain import MOST_SHAPES, NextViews, next_views
 from jaxshape.results.folder import ResultFolder, camera_poses, extent, read_folder
 
 BEST = 3
-"""Views that are named."""
+"""Number of views that are named."""
 
 APART = 40.0
-"""Degrees between the views that are named: neighbours tell the same."""
+"""Least angle between named views, in degrees: neighbouring views give the same information."""
 
 
 class Looked(NamedTuple):
@@ -32,7 +32,7 @@ class Looked(NamedTuple):
 
     Attributes:
         found: The result folder.
-        views: The cameras to choose from, and what each would tell.
+        views: The cameras to choose from, with the information gain of each.
         best: Numbers of the best cameras, the best first, far enough apart to differ.
         floor: Height of the floor in the object frame, in metres.
     """
@@ -49,12 +49,12 @@ class Looked(NamedTuple):
 
 
 def look(folder: Path, *, distance: float | None = None) -> Looked:
-    """The views that would tell most about the object of a result folder. [host]
+    """The next views that give most information about the object of a result folder. [host]
 
     Args:
         folder: Folder made by `reconstruct` or `demo`.
-        distance: Distance of the cameras from the object's centre, in metres; None for that at
-            which it was filmed, or where a Kinect stands.
+        distance: Distance of the cameras from the object's centre, in metres; None for the distance
+            at which it was filmed, or for that of a Kinect if this is not known.
 
     Raises:
         ValueError: The folder holds no finished grids, or no samples.
@@ -130,7 +130,7 @@ def _noise(found: ResultFolder) -> float:
 
 
 def _apart(views: NextViews) -> list[int]:
-    """The best cameras of which none is near another."""
+    """The best cameras, no two of which are near each other."""
     eyes = np.asarray(views.T_object_camera.translation())
     toward = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
     chosen: list[int] = []

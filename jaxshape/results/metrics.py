@@ -125,10 +125,10 @@ def shape_scores(
     """Score one predicted grid against the true one, in units of the grid's cube. [host]
 
     The point sets are centres of the voxel faces between occupied and free (`boundary_points`), so
-    that equal grids score 0 and 1 without sampling noise. With 32 voxels along an axis nothing else
-    lies within 1 % of the cube, a third of a voxel: the F-score is the share of the voxels' surface
-    that is exactly right. A grid's axes each have their own scale, so distances are those of the
-    cube, not metres.
+    that equal grids score 0 and 1 without sampling noise. With 32 voxels along an axis, 1 % of the
+    cube is a third of a voxel, and no other point lies that near: the F-score is the share of the
+    voxels' surface that is exactly right. A grid's axes each have their own scale, so distances are
+    those of the cube, not metres.
 
     Args:
         predicted: Occupied voxels of the prediction `[x y z]`.
@@ -167,7 +167,7 @@ def occluded_scores(
     occluded: Float[Array | np.ndarray, "*batch x y z"] | Bool[Array | np.ndarray, "*batch x y z"],
     truth: Bool[Array | np.ndarray, "*batch x y z"],
 ) -> OccludedScores:
-    """Score what fills the occluded voxels, those that are more likely unknown than not.
+    """Score the shape in the occluded voxels, which are those more likely unknown than not.
 
     Args:
         logits: Logits of the shape that fills them `[*batch x y z]`.
@@ -198,7 +198,7 @@ def boundary_points(occupied: Bool[Array | np.ndarray, "x y z"]) -> Float[np.nda
 
 
 class Reliability(NamedTuple):
-    """How often what was given a probability came true, by bins of equal width.
+    """Predicted probabilities and observed frequencies of occupied voxels, in equal bins.
 
     Attributes:
         predicted: Mean probability of the voxels in each bin `[bin]`; 0 where there are none.
@@ -219,7 +219,7 @@ class Reliability(NamedTuple):
 def reliability(
     probability: Float[np.ndarray, " n"], occupied: Bool[np.ndarray, " n"], bins: int = 15
 ) -> Reliability:
-    """Compare probabilities with what came true. [host]
+    """Compare predicted probabilities with the true occupancy of voxels. [host]
 
     Args:
         probability: Probabilities of voxels `[n]`, from 0 to 1.

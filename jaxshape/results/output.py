@@ -27,11 +27,12 @@ from jaxshape.search.reconstruction import Reconstruction
 from jaxshape.search.refiner import StopReason
 
 SMOOTHING = 20
-"""Rounds of Taubin's filter that take the staircase off a boolean grid."""
+"""Number of rounds of Taubin's filter that smooth the steps of a boolean grid."""
 
 
 COLOR_REACH = 2.0
-"""Voxels over which measured vertices take over a colour from nearby where no frame shows them."""
+"""Distance, in voxels, over which measured vertices that no frame shows take over a nearby colour.
+"""
 
 
 class Observation(NamedTuple):
@@ -46,13 +47,13 @@ class Observation(NamedTuple):
         truth: Complete surface of the object `[x y z]`; None where it is not known.
         field: Fused signed distances, whose surface becomes the mesh where something was measured;
             None makes the mesh from the composed grid.
-        views: Frames that give the mesh its colours, gone through once; none leave it without.
+        views: Frames that give the mesh its colours, read once; without frames it has no colours.
         sensor: How the noise of depth grows.
-        keyframes: The keyframes that the mesh is judged by; none leave it unjudged.
+        keyframes: The keyframes that the mesh is judged by; without any it is not judged.
         floor: Height of the floor in the object frame, in metres; NaN where it is not known.
-        unseen: What no keyframe saw of the object.
-        soft: F and M as the prior took them, which `occupied` and `occluded` round; None for binary
-            ones.
+        unseen: Parts of the object that no keyframe saw.
+        soft: F and M as given to the prior; `occupied` and `occluded` are their rounded values.
+            None for binary ones.
         cloud: Points in the object frame that the mesh is judged by where there are no keyframes
             `[n 3]`, in metres; None leaves it unjudged.
     """
@@ -90,7 +91,7 @@ def write_result(
     Returns:
         The content of `result.json`: `figures`, the objective before and after in nats per voxel,
         what the search took and why it stopped, the share of the mesh's area that was measured and
-        the number of loose pieces that were left out, whether what is hidden was filled from its
+        the number of loose pieces that were left out, whether hidden parts were filled from their
         mirror image and the share of the measured halves that agrees, and the IoUs where the truth
         is known.
 
@@ -112,8 +113,8 @@ def write_shape(
     """Write `mesh.glb`, `mesh.ply`, `grid.npz` and `trace.npz` of ONE object; returns its figures.
 
     `mesh.ply` lies in the world, `mesh.glb` in the object frame: +y is up in its standard. Both are
-    in metres. The trace has a row for each iteration of the search; there is none of the encoder
-    alone.
+    in metres. The trace has a row for each iteration of the search; without a search, there is no
+    trace.
     """
     return write_shape_mesh(folder, observation, reconstruction, figures)[0]
 
@@ -150,9 +151,9 @@ class ShapeMesh(NamedTuple):
         measured: True for vertices on the measured surface, False for predicted ones; None for the
             mesh of a composed grid.
         color: Colours of the vertices; None where no frame has colours.
-        dropped: Loose pieces that were left out.
-        confidence: Probability that there is surface at each vertex, from 0 to 1; None where
-            nothing says how sure the shape is.
+        dropped: Number of loose pieces that were left out.
+        confidence: Probability that there is surface at each vertex, from 0 to 1; None where the
+            probability of the shape is not known.
     """
 
     mesh: trimesh.Trimesh
@@ -168,12 +169,12 @@ def shape_mesh(
     logits: Float[np.ndarray, "x y z"],
     probability: Float[np.ndarray, "x y z"] | None = None,
 ) -> ShapeMesh:
-    """The mesh of what was measured and, elsewhere, of the decoded shape.
+    """The mesh of the measured surface and, elsewhere, of the decoded shape.
 
     Args:
         observation: Measurement of the object.
         composed: The composed grid, which makes the mesh where there are no signed distances.
-        logits: Logits of the shape that fills what was not measured.
+        logits: Logits of the shape that fills the unmeasured parts.
         probability: Probability that each voxel is surface; None leaves the mesh without
             confidence.
 

@@ -43,7 +43,7 @@ def write_progress(
     *,
     running: bool,
 ) -> dict[str, Any]:
-    """Write all files of a reconstruction but the checkpoint, as far as there is something.
+    """Write all available files of a reconstruction except the checkpoint.
 
     Args:
         folder: The result folder.
@@ -102,7 +102,7 @@ def observation_of(state: MapState) -> Observation:
 
 
 def seen_views(state: MapState) -> tuple[SeenView, ...]:
-    """The keyframes of a map, as a mesh in the object frame is compared with them."""
+    """The keyframes of a map, in the form that is compared with a mesh in the object frame."""
     T_object_world = np.linalg.inv(state.place.box.T_world_object)
 
     def seen(one: Keyframe) -> SeenView:
@@ -223,7 +223,7 @@ def keyframe_entries(sequence: Sequence, progress: Progress) -> dict[str, Any]:
 
 
 def _as_fused(progress: Progress) -> Iterator[FrameLog]:
-    """The logs of all frames; a keyframe without the object is one that was tracked."""
+    """The logs of all frames; a keyframe without the object counts as tracked only."""
     fused = {log.index for log, _ in _fused(progress)}
     reason = "no pixel was taken for the object"
     for log in progress.logs:

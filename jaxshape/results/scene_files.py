@@ -89,10 +89,10 @@ def write_scene(
 def write_scene_progress(
     folder: Path, sequence: Sequence, scene: Scene, figures: dict[str, Any]
 ) -> None:
-    """Write what is known of a scene that is still followed, so that `jaxshape view` can watch.
+    """Write the present state of a scene that is still followed, for `jaxshape view` to show.
 
     `mesh.ply` is the surface of the measured voxels of all objects, whose classes are not known
-    yet; what an earlier run left of finished objects is removed.
+    yet; files of finished objects from an earlier run are removed.
 
     Args:
         folder: The result folder.
@@ -242,7 +242,7 @@ def scene_entries(
 
 
 def scene_warnings(scene: Scene) -> list[str]:
-    """What a user should look at in a scene, in sentences.
+    """Warnings about a scene that a user should look at, in sentences.
 
     Args:
         scene: The scene.

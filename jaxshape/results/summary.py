@@ -144,7 +144,7 @@ def entries(value: Any) -> list[Any]:
 
 
 def number(value: Any, digits: int = 0, *, times: float = 1.0, unit: str = "") -> str:
-    """A number for people; nothing for what is none, a dash for what is not finite."""
+    """A number for people; empty if it is not a number, a dash if it is not finite."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return ""
     return f"{times * value:.{digits}f}{unit}" if math.isfinite(value) else "–"

@@ -30,7 +30,7 @@ def surface(
     """The closed surface around the voxels more probable than a level, in metres. [host]
 
     Marching cubes runs between voxel centres (at +0.5), with free space all around the grid.
-    Normals point from occupied to free. Occupancy is a shell around what may be hollow, so the mesh
+    Normals point from occupied to free. Occupancy is a shell that may be hollow inside, so the mesh
     has outer sheets and, around a cavity, inner ones whose normals point into the cavity: the
     signed volume is that of the shell alone, and positive.
 
@@ -38,8 +38,9 @@ def surface(
         probability: Probability of each voxel `[x y z]`, from 0 to 1, or booleans.
         frame: Voxel frame of the grid, which maps it to the object frame.
         level: Probability at the surface, between 0 and 1.
-        smoothing: Rounds of Taubin's filter, 0 or more, that take the staircase off a boolean grid;
-            about 20 are enough. Unlike a blur of the grid they cannot lose a leg one voxel thin.
+        smoothing: Rounds of Taubin's filter, 0 or more, that smooth the steps of a boolean grid;
+            about 20 are enough. Unlike a blur of the grid, they cannot lose a leg that is one voxel
+            thin.
         T_world_object: Rigid motion from the object frame to the world `[4 4]`; None leaves the
             mesh in the object frame.
 
@@ -77,9 +78,9 @@ def voxel_surface(
             f"highest value is {values.max(initial=0.0):.3g}."
         )
     padded = np.pad(values, 1)  # free space around, so that the surface closes at the border
-    # Exactly half way between 0 and 1, diagonal neighbours are a tie that scikit-image settles one
-    # way in one cell and the other way in the next, which leaves edges with four faces. A hair
-    # lower, they are joined.
+    # At a level exactly half way between 0 and 1, scikit-image joins diagonal neighbours in one
+    # cell and separates them in the next, which leaves edges with four faces. At a slightly lower
+    # level, they are always joined.
     vertices, faces, _, _ = marching_cubes(padded, level * (1 - 1e-6))
     mesh = trimesh.Trimesh(vertices - 1 + 0.5, faces, process=False)
     if mesh.volume < 0:  # scikit-image has returned inside-out faces

@@ -13,7 +13,7 @@ from jaxshape.search.refiner import Distribution, Trace
 
 
 class TraceError(ValueError):
-    """A result folder holds no course of a search."""
+    """A result folder holds no trace of a search."""
 
 
 class Search(NamedTuple):
@@ -64,7 +64,7 @@ def read_search(folder: str | os.PathLike[str]) -> Search:
 
     Raises:
         TraceError: The folder is no result folder, was made before traces were kept, or holds the
-            encoder's answer, for which nothing was searched.
+            encoder's shape, which takes no search.
     """
     folder = Path(folder)
     if not (folder / "result.json").is_file():
@@ -90,7 +90,7 @@ def read_search(folder: str | os.PathLike[str]) -> Search:
 
 
 def restarts(trace: Trace) -> Int[np.ndarray, " n"]:
-    """The iterations after which a population started again, its axes all equal once more."""
+    """The iterations after which a population restarted: all its axes are equal again."""
     if trace.distribution is None:
         return np.zeros(0, int)
     lengths = np.asarray(trace.distribution.axis_lengths)

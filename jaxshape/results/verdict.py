@@ -17,24 +17,26 @@ from scipy.spatial import KDTree
 from jaxshape.mapping.map.doubts import ALL_SEEN, Unseen, joined
 
 CLOSE = 0.01
-"""Metres from the mesh within which a measured point is explained, on top of the depth's noise."""
+"""Distance from the mesh, in metres and combined with the depth noise, within which a measured
+point is explained."""
 
 THROUGH = 0.03
-"""Metres by which a frame has to see past a point of the mesh, on top of the depth's noise, for
-the point to lie in free space."""
+"""Least distance, in metres and combined with the depth noise, from a point of the mesh to the
+surface that a frame sees behind it, for the point to lie in free space."""
 
 LITTLE = 0.05
-"""Share of the object's pixels in the fullest keyframe below which a keyframe adds nothing."""
+"""Share of the object's pixels, relative to the keyframe with most of them, below which a keyframe
+adds nothing."""
 
 PIECE = 0.01
-"""Share of the largest piece's area from which a loose piece counts."""
+"""Least area of a loose piece that counts, as a share of the largest piece's area."""
 
 _POINTS = 20_000  # points that are compared: the shares get exact to half a percent
 _NEAREST = 4  # faces whose distance is computed, of those with the nearest centres
 
 
 class SeenView(NamedTuple):
-    """A keyframe, as the mesh is compared with it.
+    """A keyframe, in the form that is compared with the mesh.
 
     Attributes:
         depth: Depth image `[h w]`, in metres; 0 where nothing is known, infinite where the ray met
@@ -56,19 +58,19 @@ class Quality(NamedTuple):
     Attributes:
         explained: Share of the measured points of the object that the mesh explains within 1 cm and
             twice the depth's noise.
-        measured: Share of the mesh's area on measured surface; NaN where the mesh does not tell.
+        measured: Share of the mesh's area on measured surface; NaN where this is not known.
         mirrored: Share of the area whose mirror image was measured, where the mesh was completed
             from it.
-        predicted: Share of the area that is the prior's alone; NaN where the mesh does not tell.
-        free_violated: Share of the area which a keyframe sees through.
+        predicted: Share of the area from the prior alone; NaN where this is not known.
+        free_violated: Share of the area that a keyframe sees through.
         size: Extents of the mesh along the object's x, y and z `[3]`, in metres.
         floor_gap: Height of the mesh's lowest point above the floor, in metres; NaN where no floor
             is known.
-        pieces: Pieces of the mesh that are not connected, crumbs apart.
+        pieces: Number of disconnected pieces of the mesh, without crumbs.
         keyframes: Number of keyframes.
-        empty_keyframes: Keyframes in which next to nothing was taken for the object.
-        unseen_faces: Names of the faces of its box at which it was not seen to end.
-        unseen_below: Share of its height, from below, of which nothing was measured.
+        empty_keyframes: Number of keyframes in which almost no pixel was taken for the object.
+        unseen_faces: Names of the faces of its box where no keyframe saw the object end.
+        unseen_below: Share of its height, from the bottom, in which nothing was measured.
     """
 
     explained: float
@@ -122,9 +124,9 @@ def quality_of(
         measured: True for its vertices on measured surface; None where that is not known.
         views: The keyframes.
         axial: Standard deviation of depth, in metres at 1 m.
-        is_mirrored: Whether what is hidden was completed from its mirror image.
+        is_mirrored: Whether hidden parts were completed from their mirror image.
         floor: Height of the floor in the object frame, in metres; NaN where it is not known.
-        unseen: What no keyframe saw of the object.
+        unseen: Parts of the object that no keyframe saw.
     """
     counts = np.array([view.segmented.sum() for view in views])
     return _of_mesh(mesh, measured, is_mirrored)._replace(
@@ -150,12 +152,12 @@ def quality_of_cloud(
     Args:
         mesh: The mesh in the object frame, in metres.
         points: The points, in the same frame.
-        voxel: Largest edge of the voxels that the mesh was made from, in metres: closer than
-            that neither can be told from the other.
-        is_mirrored: Whether what is hidden was completed from its mirror image.
+        voxel: Largest edge of the voxels that the mesh was made from, in metres: mesh and points
+            cannot be told apart at smaller distances.
+        is_mirrored: Whether hidden parts were completed from their mirror image.
 
     Returns:
-        The figures; nothing is known of free space, of the floor and of what was seen.
+        The figures; nothing is known about free space, the floor and unseen parts.
     """
     close = max(CLOSE, voxel)
     measured = np.isfinite(KDTree(points).query(mesh.vertices, distance_upper_bound=close)[0])
@@ -167,7 +169,7 @@ def quality_of_cloud(
 def _of_mesh(
     mesh: trimesh.Trimesh, measured: Bool[np.ndarray, " n"] | None, is_mirrored: bool
 ) -> Quality:
-    """The figures of the mesh alone; as if it were right elsewhere."""
+    """The figures of the mesh alone; all other figures are as if the mesh were right."""
     x, y, z = map(float, mesh.extents)
     of_area = _shares(mesh, measured, is_mirrored)
     return Quality(1.0, *of_area, 0.0, (x, y, z), np.nan, pieces(mesh), 0, 0)
@@ -185,7 +187,7 @@ def explained(mesh: trimesh.Trimesh, views: Sequence[SeenView], axial: float) ->
 
 
 def free_violated(mesh: trimesh.Trimesh, views: Sequence[SeenView], axial: float) -> float:
-    """Share of the mesh's area through which a keyframe looks at what lies behind."""
+    """Share of the mesh's area through which a keyframe sees a surface behind it."""
     centers, through = mesh.triangles_center, np.zeros(len(mesh.faces), bool)
     for view in views:
         through |= _sees_through(view, centers, axial)
@@ -201,35 +203,37 @@ def pieces(mesh: trimesh.Trimesh) -> int:
 
 # Words -----------------------------------------------------------------------------------------
 
-# On the kitchen chair (every fourth frame), of the points explained and the area seen through:
-# as it is .93 and .01 with 3 keyframes, .80 and .03 with 8; a focal length 10 % too long .75 and
-# .30; a depth scale 25 % too large .93 and .33; poses in millimetres 1.0 and 0, for 6 of 7
-# keyframes hold nothing of the object.
+# Shares of the points explained and of the area seen through, on the kitchen chair (every fourth
+# frame): .93 and .01 with 3 keyframes and correct input, .80 and .03 with 8; .75 and .30 with a
+# focal length 10 % too long; .93 and .33 with a depth scale 25 % too large; 1.0 and 0 with poses in
+# millimetres, because 6 of 7 keyframes then hold nothing of the object.
 
 FAILED, DOUBTFUL = 0.5, 0.75
-"""Share of the measured points below which a mesh failed to explain them, and is doubtful."""
+"""Share of explained points below which a mesh has failed, and share below which it is doubtful."""
 
 LITTLE_MEASURED = 0.12
-"""Share of the area below which a mesh is more the prior's than the camera's."""
+"""Share of measured area below which a mesh comes from the prior rather than from the camera."""
 
 SEEN_THROUGH, TORN = 0.1, 0.25
-"""Share of the area which keyframes see through, from which a mesh is doubtful, and failed: poses,
-camera or depth scale are wrong."""
+"""Share of the area that keyframes see through, from which a mesh is doubtful, and share from which
+it has failed: poses, camera or depth scale are wrong."""
 
 GAP = 0.05
-"""Metres between the mesh and the floor from which a part of the object is missing or too much."""
+"""Distance between the mesh and the floor, in metres, from which a part of the object is missing or
+too much."""
 
 SIZES = (0.05, 4.0)
-"""Metres of the longest side between which an object of a room lies."""
+"""Shortest and longest length of the longest side of an object in a room, in metres."""
 
 GUESSED, ALL_GUESSED = 2, 4
-"""Sides of the box at which the object was not seen to end, from which its size is doubtful, and
-from which it is the prior's alone. One is the rule: the back of a chair that was filmed from the
-front was right to 4 cm."""
+"""Numbers of unseen sides of the box, where no keyframe saw the object end: from the first number
+on, the object's size is doubtful; from the second on, it comes from the prior alone. One unseen
+side is usual: the back of a chair that was filmed from the front was right to 4 cm."""
 
 BARE, MOSTLY_BARE = 0.15, 0.4
-"""Share of the height, from below, without a measurement, from which legs are doubtful, and from
-which too little was seen: of a chair behind a table, the back."""
+"""Shares of the height, from the bottom, without a measurement: from the first share on, legs are
+doubtful; from the second on, too little was seen, for example only the back of a chair behind a
+table."""
 
 
 def judged(quality: Quality) -> Verdict:
@@ -303,7 +307,7 @@ def _shares(
 
 
 def _object_points(view: SeenView) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Points that a keyframe took for the object, in its frame, and their depth."""
+    """Points of the object in a keyframe, in the object frame, and their depth."""
     row, column = np.nonzero(view.segmented & (view.depth > 0) & np.isfinite(view.depth))
     fx, fy, cx, cy = view.intrinsics
     z = view.depth[row, column].astype(np.float64)
@@ -326,7 +330,7 @@ def _sees_through(
 ) -> Bool[np.ndarray, " n"]:
     """Whether all pixels around a point measured something clearly behind it."""
     known = np.where(view.depth > 0, view.depth, 0)
-    nearest = ndimage.minimum_filter(known, 3)  # 0 beside what is not known: that says nothing
+    nearest = ndimage.minimum_filter(known, 3)  # 0 beside unknown pixels, which give no evidence
     T = np.linalg.inv(view.T_object_camera)
     x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
     fx, fy, cx, cy = view.intrinsics
