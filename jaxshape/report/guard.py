@@ -1,7 +1,7 @@
 """The live view answers only requests of its own page, at one of its own addresses.
 
-A browser sends a page from anywhere to 127.0.0.1, too. The name that it was given for the machine
-(`Host`) and the page that asks (`Origin`) tell such requests from those of the view. [host]
+In a browser, a page from any site can send requests to 127.0.0.1, too. The name of the machine in a
+request (`Host`) and the page that asks (`Origin`) tell such requests from those of the view. [host]
 """
 
 import ipaddress
@@ -18,7 +18,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def is_own(hosts: Sequence[str], origins: Sequence[str], served: str) -> bool:
-    """Whether a request is of the view itself.
+    """Whether a request comes from the page of the view itself.
 
     Args:
         hosts: All headers `Host` of the request.
@@ -26,8 +26,8 @@ def is_own(hosts: Sequence[str], origins: Sequence[str], served: str) -> bool:
         served: Address at which the view listens.
 
     Returns:
-        True where one host is named, by an address or a name of this machine, and the page that
-        asks, if any, came from there.
+        True where the request names one host, by an address or a name of this machine, and the page
+        that asks, if any, came from that host.
     """
     if len(hosts) != 1 or len(origins) > 1:
         return False
@@ -48,7 +48,7 @@ def _own_names() -> tuple[str, ...]:
 
 
 def _is_address(name: str) -> bool:
-    """Whether a host is given by its number; a foreign name cannot point to a number."""
+    """Whether a host is given as an IP address, which a foreign host name cannot imitate."""
     try:
         ipaddress.ip_address(name)
     except ValueError:
@@ -58,9 +58,10 @@ def _is_address(name: str) -> bool:
 
 @contextmanager
 def guarded(served: str) -> Iterator[None]:
-    """Let a server that viser starts in the block refuse requests that are not its own.
+    """Let a server that viser starts in the block refuse requests from other pages.
 
-    Viser offers no place to ask; it hands its answers to `websockets`, where they are wrapped.
+    Viser has no option for this. It passes its request handler to `websockets`; there the handler
+    is wrapped.
 
     Args:
         served: Address at which the view listens.

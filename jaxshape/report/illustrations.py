@@ -51,8 +51,8 @@ class Picture(NamedTuple):
 def scene(found: ResultFolder) -> dict[str, Any]:
     """The scene that page.js draws: layers in the object frame, and the view.
 
-    Numbers travel as base64 of their little-endian bytes; grids as bits, 4 KiB each, of which the
-    page makes cubes itself.
+    Numbers are stored as base64 of their little-endian bytes, grids as bits, 4 KiB each, which the
+    page turns into cubes.
     """
     mesh, origin, voxel_size = mesh_in_object(found), found.origin, found.voxel_size
     grid = next(iter(found.grids.values()), np.zeros((32, 32, 32), bool))
@@ -116,7 +116,7 @@ def _pairs(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n-1 2 2"]:
 
 
 def still(found: ResultFolder) -> Picture | None:
-    """The mesh, for where it cannot be turned."""
+    """A still picture of the mesh, for pages that cannot show it in 3D."""
     mesh = mesh_in_object(found)
     if mesh is None:
         return None
@@ -157,7 +157,7 @@ def _grid_panel(title: str, name: str, have: dict[str, Any], note: str) -> Panel
 
 
 def keyframes(chosen: Sequence[KeyframeRecord]) -> list[list[Picture]]:
-    """Colour with the object's outline, and depth, of each keyframe, where the images exist."""
+    """For each keyframe, colour with the object's outline and depth, if the images exist."""
     depths = [_depth(keyframe) for keyframe in chosen]
     panels = iter(depth_panels([depth for depth in depths if depth is not None]))
     pictured = []

@@ -15,15 +15,15 @@ from jaxshape.results.looking import Looked
 from jaxshape.results.surface import surface
 
 NEAR = 1.6
-"""Radii of the object at which cameras are drawn, nearer than they are."""
+"""Distance at which cameras are drawn, in radii of the object; they are farther away in reality."""
 
 
 def write_next_views(path: Path, looked: Looked) -> None:
-    """Draw the object, the cameras coloured by what they would tell, and the best of them.
+    """Draw the object, the cameras coloured by their information gain, and the best of them.
 
     Args:
         path: The picture to write.
-        looked: What was found.
+        looked: The object and the next views that were found.
     """
 
     def draw(figure: Any) -> None:

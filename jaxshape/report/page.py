@@ -83,7 +83,7 @@ def filled_page(
         kind: Kind of the page, in small print.
         title: Title of the page.
         subtitle: A line below the title.
-        figures: Name, value and meaning of each of the figures at its top.
+        figures: Name, value and meaning of each figure at the top of the page.
         body: Sections of the page, as HTML.
         scene: Data of the script, as JSON can hold it.
         script: The page's own script; no other script may run.
@@ -132,7 +132,7 @@ def _warnings(found: ResultFolder) -> str:
 
 
 def _shape(found: ResultFolder, scene: dict[str, Any]) -> str:
-    """The shape to turn, with a box for each layer, over a picture for where WebGL is missing."""
+    """The shape in 3D, with a checkbox for each layer, over a picture for use without WebGL."""
     if not scene["layers"]:
         return ""
     boxes = "".join(

@@ -14,7 +14,7 @@ class Paint(NamedTuple):
     """Colours of the vertices of a mesh.
 
     Attributes:
-        label: Text that names them.
+        label: Text that names the colours.
         colors: A colour for each vertex.
     """
 
@@ -26,11 +26,11 @@ def paints(found: ResultFolder) -> dict[str, Paint]:
     """The colours in which the mesh of a result can be shown, by name; the first is shown first.
 
     Args:
-        found: The result. Meshes of older results, and of points, have neither.
+        found: The result. Meshes of older results, and of points, have none of these colours.
 
     Returns:
         "color" where frames gave the mesh colours, "source" where it is known which vertices were
-        measured, and "confidence" where it is known how sure they are.
+        measured, and "confidence" where the confidence of the vertices is known.
     """
     from matplotlib import colormaps  # it takes long to import
 

@@ -146,7 +146,7 @@ def write_panels(path: str | os.PathLike[str], rows: Iterable[Sequence[Panel]]) 
 
 
 def _row_height(row: Sequence[Panel]) -> int:
-    """Height in pixels at which the panels of a row, none above 300 tall, share the width."""
+    """Height in pixels, at most 300, at which the panels of a row together fill the width."""
     aspect = sum(panel.image.shape[1] / panel.image.shape[0] for panel in row)
     return int(min(300, (_WIDTH - _GAP * (len(row) + 1)) / max(aspect, 1e-6)))
 

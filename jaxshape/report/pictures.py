@@ -70,7 +70,7 @@ def render_voxels(
     palette = np.stack([rgb(color) for color in colors])
     canvas = np.ones((pixels, pixels, 3))
     nearest = np.full((pixels, pixels), -np.inf)
-    for axis in (axis for axis in range(3) if abs(view[2, axis]) > 1e-6):  # not those edge-on
+    for axis in (axis for axis in range(3) if abs(view[2, axis]) > 1e-6):  # no faces edge-on
         cells = _facing_cells(labels != 0, axis, view[2])
         centered = cells - np.array(labels.shape) / 2
         cell, row, column, s, t = _face_pixels(centered, axis, view, pixels_per_voxel)
@@ -188,7 +188,8 @@ def render_mesh(
 ) -> UInt8[np.ndarray, "size size 3"]:
     """Draw a mesh, smoothly shaded and scaled to fill the picture, by casting a ray per pixel.
 
-    `color` is one as `#rrggbb`, or one for each vertex. A mesh without faces gives a white picture.
+    `color` is one colour as `#rrggbb`, or one for each vertex. A mesh without faces gives a white
+    picture.
     Fast where `embreex` is installed.
     """
     pixels = size * _SUPERSAMPLING

@@ -103,7 +103,7 @@ def _losses(axes: Any, trace: Trace) -> None:
 
 
 def _above(losses: Float[Array | np.ndarray, " n"], lowest: float) -> Float[np.ndarray, " n"]:
-    """The excess over the lowest loss, NaN where there is none to show on a logarithmic axis."""
+    """The excess over the lowest loss; NaN where a logarithmic axis cannot show it."""
     excess = np.asarray(losses, np.float64) - lowest
     return np.where((excess > 0) & np.isfinite(excess), excess, np.nan)
 
@@ -117,7 +117,7 @@ def _step_size(axes: Any, evaluations: Any, normal: Distribution) -> None:
 
 
 def _bundle(axes: Any, title: str, evaluations: Any, values: Any) -> None:
-    """A line per column, from dark to light by where it stands at last."""
+    """A line for each column, from dark to light in the order of the last values."""
     from matplotlib import colormaps
 
     order = np.argsort(np.argsort(values[-1]))

@@ -12,10 +12,10 @@ from jaxshape.report.palette import CYCLE, INK
 from jaxshape.report.pictures import rgb
 
 _WIDTH = 960
-"""Width of the picture, in pixels, of which smaller images are enlarged."""
+"""Width, in pixels, to which smaller images are enlarged."""
 
 _TINT = 0.55
-"""Share of an object's colour in its pixels."""
+"""Weight with which the colour of an object is mixed into its pixels."""
 
 
 def write_proposals(

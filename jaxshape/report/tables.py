@@ -63,7 +63,7 @@ def keyframe_table(keyframes: Sequence[KeyframeRecord]) -> str:
 
 
 def objects(found: ResultFolder) -> str:
-    """The objects of a scene, and what became of them while it was filmed."""
+    """The objects of a scene, and their history while it was filmed."""
     if "objects" not in found.result:
         return ""
     rows = map(_object_row, entries_of_objects(found.result))
@@ -94,7 +94,7 @@ def _object_row(one: dict[str, Any]) -> tuple[str, ...]:
 
 
 def frame_strip(found: ResultFolder) -> str:
-    """A strip with a colour for each frame, and the runs of frames that fared alike."""
+    """A strip with a colour for each frame, and the runs of frames with the same outcome."""
     if not found.frames:
         return ""
     fared = lambda frame: (str(frame.get("status")), str(frame.get("reason") or ""))  # noqa: E731

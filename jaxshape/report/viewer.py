@@ -53,7 +53,7 @@ class LiveView:
         self.folder = Path(folder)
         self.found = read_folder(self.folder)  # refuses a missing folder before a server is up
         _require_own(host)
-        with redirect_stdout(io.StringIO()), guarded(host):  # a banner
+        with redirect_stdout(io.StringIO()), guarded(host):  # hides a banner
             self.server = viser.ViserServer(host=host, port=port, label="jaxshape", verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self._stamps: dict[str, Any] = {}
@@ -83,7 +83,7 @@ class LiveView:
     def _panel(self) -> None:
         """Build the panel next to the picture: figures, layers to show, keyframes."""
         gui = self.server.gui
-        # Sharing would send the scene through a machine elsewhere.
+        # Sharing would send the scene through another machine.
         gui.configure_theme(show_logo=False, show_share_button=False)
         self.figures = gui.add_html("")
         self.boxes = {}
@@ -113,7 +113,7 @@ class LiveView:
         was_last = self.slider.value >= self.slider.max or self.slider.value >= count
         self.slider.max = max(1, count - 1)
         if was_last and count:
-            self.slider.value = count - 1  # go along with a reconstruction that runs
+            self.slider.value = count - 1  # follow a running reconstruction
         self._choose()
 
     def _choose(self) -> None:
@@ -191,7 +191,7 @@ def view(
 
 
 def _require_own(host: str) -> None:
-    """Viser would try one port after the other for an address that is not this machine's."""
+    """Refuse an address of another machine, for which viser would try one port after the other."""
     try:
         socket.create_server((host, 0)).close()
     except OSError as problem:
