@@ -3,9 +3,10 @@ r"""The object's pose, size and code from a wrong start: 15 degrees, 15 % and 3 
     python experiments/alignment.py --meshes cad_chairs/
 
 CAD seats with a Kinect's noise, 1, 4 and 8 frames along an arc, true camera poses. The start is
-turned by 15 degrees, larger or smaller by 15 % along all axes, 3 cm aside, and has the mean code.
-From there: `place`, which moves box and code together, once by itself and once with the faces of
-the box put where the frames saw the object end, as `reconstruct` does after every placement.
+turned by 15 degrees, larger or smaller by 15 % along all axes, shifted by 3 cm, and has the mean
+code. From this start, `place` moves box and code together. It is run once by itself, and once with
+the faces of the box moved to where the frames saw the object end, as `reconstruct` does after every
+placement.
 
 Medians over the seats: yaw error in degrees; error of the extents in per cent, all three axes and
 the largest of each seat; distance of the centre in cm. The target is 3 degrees and 2 %.
@@ -44,9 +45,9 @@ RESULTS = Path(__file__).parent / "results"
 SHAPE, LENS = (240, 320), Intrinsics(*jnp.float32([280, 280, 160, 120]))
 DISTANCE, ELEVATION, STEP = 2.0, 25.0, 30.0
 LARGEST = 0.9
-"""Metres of the largest extent of each seat."""
+"""Largest extent of each seat, in metres."""
 TURN, GROW, ASIDE = 15.0, 1.15, 0.03
-"""Errors of the start, in degrees, as a factor, and in metres."""
+"""Errors of the start: turn in degrees, size as a factor, and shift in metres."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Config:
     meshes: Path = Path("cad_chairs")
     """Folder or archive of seats, +y up and +z in front."""
     seats: int = 78
-    """Number of seats, spread over all."""
+    """Number of seats, spread over all seats."""
     frames: tuple[int, ...] = (1, 4, 8)
     results: Path = RESULTS
     smoke: bool = False
@@ -128,7 +129,7 @@ def _align(
 def _film(
     mesh: trimesh.Trimesh, count: int, rng: np.random.Generator
 ) -> tuple[RaySamples, list[Cutout]]:
-    """Frames along an arc from anywhere: rays, and the depth images."""
+    """Frames along an arc with a random start: rays, and the depth images."""
     azimuth = rng.uniform(0, 360) + STEP * np.arange(count)
     elevation = jnp.full(count, ELEVATION)
     T = camera.on_sphere(jnp.float32(azimuth), elevation, DISTANCE)
@@ -151,7 +152,7 @@ def _wrong_start(extents: np.ndarray, prior: ShapePrior, rng: np.random.Generato
         jaxlie.SO3.from_y_radians(jnp.float32(yaw)),
         jnp.float32(ASIDE * aside / np.linalg.norm(aside)),
     )
-    large = jnp.float32(1e3)  # a misfit that any other betters
+    large = jnp.float32(1e3)  # a misfit worse than any other
     return Placement(T, jnp.float32(factor * extents), prior.code_mean, large, jnp.float32(0))
 
 
@@ -161,7 +162,7 @@ def _box(placement: Placement) -> Box:
 
 
 def errors(box: Box, extents: np.ndarray) -> dict[str, Any]:
-    """Errors of a box whose true one is centred and not turned."""
+    """Errors of a box, where the true box is centred and not turned."""
     front = box.T_world_object[:3, 2]
     return {
         "yaw": float(np.degrees(np.arctan2(front[0], front[2]))),

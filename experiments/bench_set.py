@@ -68,7 +68,7 @@ class Config:
     steps: int = 400
     """Steps of Adam."""
     at_a_time: int = 8
-    """Problems searched together."""
+    """Number of problems that are searched together."""
 
 
 def main(config: Config) -> None:

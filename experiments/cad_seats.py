@@ -9,9 +9,9 @@ r"""The 78 CAD seats and 62 CAD tables of the tests, from two packages that anyo
 Debian's `sweethome3d-furniture` 1.8-1 (any release that has it, or packages.debian.org) holds 67
 seats and 52 tables in furniture catalogues, whose rotations and sizes are applied; npm's
 `open3dfloorplan` holds 11 and 10 of Kenney's Furniture Kit. experiments/cad_seats.json and
-cad_tables.json list which they are, of what kind, who made them and under which licence (CC0 or
-CC-BY: name the creator). The tables are all tables of the packages, including desks and night
-stands, without copies of a mesh in another material.
+cad_tables.json list the pieces with their kind, their maker and their licence (CC0 or CC-BY: name
+the creator). The tables are all tables of the packages, including desks and night stands, without
+copies of a mesh in another material.
 
 Writes a folder of PLY files in the canonical frame (metres, +y up, front along +z, centred) and
 manifest.json, which repeats the entries of the list. No model is trained on them. Time: 20 seconds.
@@ -34,7 +34,7 @@ from jaxshape.results.surface import write_mesh
 
 LISTS = {name: Path(__file__).with_name(f"cad_{name}.json") for name in ("seats", "tables")}
 SIZE_TOLERANCE = 0.002
-"""Metres by which a piece may differ from the size in the list."""
+"""Largest difference between the size of a piece and its size in the list, in metres."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Config:
     """Sources and output."""
 
     packages: Path = Path("packages")
-    """The folder both packages were unpacked in: it has `usr/` and `package/`."""
+    """The folder in which both packages were unpacked: it has `usr/` and `package/`."""
     output: Path = Path("cad_chairs")
     """Folder to write."""
     list: Literal["seats", "tables"] = "seats"
@@ -61,9 +61,9 @@ class Piece(NamedTuple):
     package: str
     """Name and version of the package that holds it."""
     file: str
-    """Below the folder of the packages."""
+    """Path below the folder of the packages."""
     member: str | None
-    """Inside the file, where that is a catalogue."""
+    """Name inside the file, if the file is a catalogue."""
     size: list[float]
     """Size along x, y, z in metres, which identifies the version."""
 

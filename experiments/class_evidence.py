@@ -1,13 +1,13 @@
-r"""What priors predict of hidden parts: does it tell chairs, tables and things of neither apart?
+r"""Do the priors' predictions of hidden parts tell chairs, tables and other objects apart?
 
     python experiments/class_evidence.py --tables table.safetensors
 
-Objects that nobody trained on, seen in six frames along an arc of 90 to 200 degrees with a Kinect's
-noise, 320 x 240 pixels; things of neither class are boxes, plants, lamps, bins and balls. The true
-front is the first of the four, so that a front is right where no quarter turn is found.
+Objects that no network was trained on, seen in six frames along an arc of 90 to 200 degrees with a
+Kinect's noise, 320 x 240 pixels; objects of neither class are boxes, plants, lamps, bins and balls.
+The true front is the first of the four, so that a front is right where no quarter turn is found.
 
 Results: experiments/results/class_evidence.json: the confusion table, and the figures of each
-object; a run that was killed goes on.
+object; a killed run resumes.
 """
 
 import json
@@ -45,12 +45,12 @@ class Config:
     """Settings of the experiment."""
 
     count: int = 40
-    """Objects of each family; of things of neither there are twice as many."""
+    """Number of objects of each family; of objects of neither class there are twice as many."""
     tables: Path | None = None
-    """Weights for tables; None takes the class of chairs alone."""
+    """Weights for tables; None uses the class of chairs alone."""
     results: Path = RESULTS
     smoke: bool = False
-    """One object of each: does it run?"""
+    """A test run with one object of each family."""
 
 
 def main(config: Config) -> None:
@@ -81,7 +81,7 @@ def _content(settings: dict[str, Any], done: dict[str, Any]) -> dict[str, Any]:
 
 
 def objects(count: int) -> list[tuple[str, int]]:
-    """Kinds and seeds: so many of each family, and twice as many of neither."""
+    """Kinds and seeds: `count` objects of each family, and twice as many of neither class."""
     n = len(KINDS)
     return [
         one
@@ -108,7 +108,7 @@ def seen(kind: str, seed: int) -> Grids:
 
 
 def scored(priors: dict[str, ShapePrior], grids: Grids) -> dict[str, Any]:
-    """What the priors predict, and what is decided."""
+    """The scores of the priors' predictions, and the decision."""
     found = {name: predict_hidden(prior, grids) for name, prior in priors.items()}
     one = {name: Predicted(*(np.asarray(x)[0] for x in of)) for name, of in found.items()}
     decision = decided(one)
@@ -123,7 +123,7 @@ def scored(priors: dict[str, ShapePrior], grids: Grids) -> dict[str, Any]:
 
 
 def confusion(done: dict[str, Any]) -> dict[str, dict[str, int]]:
-    """How many of each kind were taken for which class, and fronts of chairs that were right."""
+    """Number of objects of each kind by decided class, and of chairs with the right front."""
     table: dict[str, dict[str, int]] = {}
     for kind in ("chair", "table", *KINDS):
         those = [one for one in done.values() if one["kind"] == kind]

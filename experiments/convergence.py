@@ -106,7 +106,7 @@ def run(config: Config) -> Journal:
 
 
 def sampled(config: Config, count: int) -> list[int]:
-    """About so many iterations, evenly spaced in their logarithm, counted from 1."""
+    """About `count` iterations, evenly spaced in their logarithm, counted from 1."""
     spaced = np.geomspace(1, config.iterations, count).round().astype(int)
     return sorted({*spaced.tolist(), config.early})
 
@@ -151,8 +151,9 @@ def fluctuation(
     """Share of iterations whose loss is above the previous one, and the uphill share of all
     changes.
 
-    `rises` is a share of the iterations that were taken, `uphill` of all changes of the loss: 0 for
-    losses that never go up, and a half for those that go up as much as down.
+    `rises` is a share of the iterations that were taken, `uphill` a share of all changes of the
+    loss. Both are 0 for losses that never rise; `uphill` is a half for losses that rise as much as
+    they fall.
     """
     change = jnp.diff(drawn)
     was_taken = jnp.arange(1, drawn.shape[1]) < taken[:, None]

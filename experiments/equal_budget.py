@@ -6,7 +6,7 @@ Every search starts from the encoder's code and may spend the same number of dec
 candidate is one call. A gradient, a forward and a backward pass, takes the measured time of three
 calls and counts as three; so does each evaluation of a line search, which needs gradients too. IoU
 and objective belong to the best code found within a number of calls. Seconds are measured for a
-batch of eight chairs and divided evenly over chairs and calls. IPOP stands for BIPOP as well: both
+batch of eight chairs and divided evenly over chairs and calls. IPOP represents BIPOP as well: both
 equal CMA-ES up to the first restart. Steps and sigma0 are the best values of step_size.py.
 
 8 procedural chairs and 8 CAD seats, seen by 4 frames as iou_by_frames.py sees them.
@@ -111,17 +111,17 @@ def run(config: Config) -> Journal:
 
 
 class Search(NamedTuple):
-    """A refiner, and how its evaluations count."""
+    """A refiner, and the cost of its evaluations in decoder calls."""
 
     refiner: Refiner
     iterations: int
     """Iterations that the budget allows."""
     candidates: int
-    """Evaluations at its beginning that need no gradient."""
+    """Number of evaluations at the beginning that need no gradient."""
     space: Literal["whitened", "raw"]
 
     def calls(self, evaluations: Int[Array, "..."]) -> Int[Array, "..."]:
-        """Decoder calls spent, the start apart, which is the encoder's."""
+        """Decoder calls spent, without the encoder's call at the start."""
         gradients = jnp.maximum(evaluations - 1 - self.candidates, 0)
         return evaluations - 1 + (GRADIENT - 1) * gradients
 
@@ -195,7 +195,7 @@ def contestant(search: Search, budgets: tuple[int, ...]) -> Contestant:
             "iou": iou(decode(prior, codes) > 0, case.surface[:, None]),
             "objective": _after(iterations, found.first_objective, found.trace.best_loss),
             "calls": calls[:, -1],
-            "ended": found.stop != StopReason.BUDGET,  # by a criterion of its own
+            "ended": found.stop != StopReason.BUDGET,  # by its own stopping criterion
         }
 
     return contest
@@ -206,7 +206,7 @@ def _after(
     first: Float[Array, "case ..."],
     later: Float[Array, "case iteration ..."],
 ) -> Float[Array, "case budget ..."]:
-    """The value after so many iterations; the first after none."""
+    """The value after each number of iterations; the first value after no iteration."""
     values = jnp.concatenate([first[:, None], later], axis=1)
     return values[jnp.arange(len(values))[:, None], iterations]
 
@@ -215,12 +215,12 @@ def _after(
 
 
 def curve(journal: Journal, config: Config, group: str | None, name: str, score: str) -> np.ndarray:
-    """A score of a search by chair, first the encoder's and then within each budget."""
+    """A score of a search for each chair: first of the encoder, then within each budget."""
     return column(journal, group, config.frames, name, score)
 
 
 def seconds_per_call(journal: Journal, config: Config, name: str) -> float:
-    """The median over chairs."""
+    """The median over chairs of the seconds of one decoder call."""
     rows = [row[str(config.frames)][name] for row in journal.rows.values()]
     return float(np.median([row["seconds"] / max(row["calls"], 1) for row in rows]))
 
@@ -246,8 +246,8 @@ def agreement(
 ) -> np.ndarray:
     """Rank correlation by chair between a low objective and a high IoU.
 
-    Over all searches and budgets, the same code counted once; or over the searches that have
-    `finished`, at the whole budget. A chair with fewer than three codes to rank is left out.
+    It is taken over all searches and budgets, with equal codes counted once, or, with `finished`,
+    over the searches at the whole budget. A chair with fewer than three codes to rank is left out.
     """
     found = np.stack(
         [

@@ -14,7 +14,7 @@ from jaxshape.report.figures import save_figure
 from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE, SKY
 
 COLUMN, PAGE = 3.5, 7.0
-"""Widths in inches: of a column of a paper, and of a page."""
+"""Width of a column of a paper, and of a page, in inches."""
 
 LINES: dict[str, dict[str, Any]] = {
     "encoder": {"color": INK, "dashes": (1, 1.2)},
@@ -25,7 +25,7 @@ LINES: dict[str, dict[str, Any]] = {
     "F, occluded empty": {"color": GREY, "dashes": ()},
     "F, occluded full": {"color": GREY, "dashes": (2, 2)},
 }
-"""Line of each search or bound, the same in every figure."""
+"""Line style of each search or bound, the same in every figure."""
 
 
 def interval(samples: Num[np.ndarray, "n ..."]) -> Float[np.ndarray, "2 ..."]:

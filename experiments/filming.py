@@ -21,9 +21,9 @@ def film(
     rng: np.random.Generator,
     T_written: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Write depth images with a Kinect's noise, their poses and the camera; the clean depth.
+    """Write depth images with a Kinect's noise, their poses and the camera; return clean depth.
 
-    `T` are the true poses, `T_written` those that are written; the true ones by default.
+    `T` are the true poses; `T_written` are the poses that are written, by default the true ones.
     """
     height, width = shape
     lens = Intrinsics(*jnp.float32([focal, focal, width / 2, height / 2]))

@@ -1,14 +1,14 @@
-r"""One chair from five first frames, with all poses, with the first, with none: is it the same one?
+r"""One chair rebuilt from five first frames, with all, one or no given pose: is it the same chair?
 
     python experiments/first_frames.py --recording kitchen/frames \
         --box experiments/kitchen_chair_box.json
 
-The slatted chair of `real_recording`, half hidden by a table. Each run begins at another frame, on
-a click at the pixel that shows the middle of the chair, and goes to the end of the recording. A run
-agrees where all extents are within 3 cm of those measured by hand. One that does not must say so:
-its verdict must not be good, or it must warn of sides that were not seen.
+The slatted chair of `real_recording`, half hidden by a table. Each run begins at another frame,
+with a click at the pixel that shows the middle of the chair, and goes to the end of the recording.
+A run agrees if all extents are within 3 cm of those measured by hand. A run that does not agree
+must say so: its verdict must not be good, or it must warn of sides that were not seen.
 
-Results: experiments/results/first_frames.json, run by run: one that was killed goes on.
+Results: experiments/results/first_frames.json, run by run: a killed experiment resumes.
 """
 
 import time
@@ -34,7 +34,7 @@ from runs import earlier
 RESULTS = Path(__file__).parent / "results"
 WAYS = ("given", "first", "none")
 NEAR = 0.03
-"""Metres by which an extent may be off."""
+"""Largest error of an extent, in metres."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def _row(one: dict[str, Any]) -> str:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Every start, each way, going on from earlier results of the same settings."""
+    """Run every start in each way, and resume from earlier results of the same settings."""
     path = config.results / "first_frames.json"
     firsts = config.first[: 1 if config.smoke else None]
     settings = {"recording": config.recording.name, "box": config.box.name, "first": list(firsts)}
@@ -92,7 +92,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def summary(runs: dict[str, dict[str, Any]]) -> dict[str, int]:
-    """Numbers of runs that agree with the size by hand, and that do not and do not say so."""
+    """Numbers of runs that agree with the hand-measured size, and of wrong runs without warning."""
     ended = [one for one in runs.values() if "failed" not in one]
     wrong = [one for one in ended if np.abs(one["off"]).max() > NEAR]
     unsaid = [one for one in wrong if one["verdict"] == "good" and not one["warnings"]]
@@ -123,7 +123,7 @@ def _rebuild(
 
 
 def middle_of(frame: Frame, box: Box) -> tuple[float, float]:
-    """The pixel of the object, u and v, that lies nearest to the middle of all its pixels."""
+    """The pixel of the object, u and v, that is nearest to the middle of all its pixels."""
     points = camera_points(frame.depth, frame.intrinsics)
     T = np.asarray(frame.T_world_camera)
     shown = points_in_box(points @ T[:3, :3].T + T[:3, 3], box)

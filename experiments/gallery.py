@@ -1,4 +1,4 @@
-r"""What is measured, proposed, refined and true, by number of frames (paper, Fig. mapping).
+r"""Measured, proposed, refined and true shape by number of frames (paper, Fig. mapping).
 
     python experiments/gallery.py --test.meshes cad_chairs/
 
@@ -43,7 +43,7 @@ from study import SEEN, TUNED, Claim, Subject, TestSet, conclude, subjects
 CREATORS = Path(__file__).with_name("cad_seats.json")
 PERCENTILES = (25, 50, 75)
 WIDTH = 8.0  # inches, 1600 pixels
-AZIMUTH = -45.0  # degrees: the side that the orbit, which sets out the other way, sees last
+AZIMUTH = -45.0  # degrees: the side that the orbit sees last, since it starts the other way round
 COLUMNS = {"F and M": BLUE, "encoder": PINK, "refined": ORANGE, "composed": ORANGE, "truth": GREEN}
 
 
@@ -56,7 +56,7 @@ class Config(study.Config):
     frames: tuple[int, ...] = (1, 2, 4, 8, 18)
     """Numbers of frames that are fused: the rows."""
     choose_at: int = 4
-    """Number of frames at which the gain decides which chairs are shown."""
+    """Number of frames at which the gain in IoU decides which chairs are shown."""
     iterations: int = 60
     """Iterations of CMA-ES (paper: 350)."""
 
@@ -86,7 +86,7 @@ def main(config: Config) -> None:
 def run(config: Config) -> tuple[Journal, list[Shown]]:
     """Choose the chairs, rebuild them after each number of frames, and write the results.
 
-    No chairs are returned where the results of these settings are there, with their pictures.
+    No chairs are returned if the results of these settings and their pictures already exist.
     """
     prior = load_prior(config.weights)
     settings = {
@@ -127,8 +127,8 @@ def _by_group(test: TestSet) -> dict[str, list[Subject]]:
 
 
 def at_percentiles(values: Sequence[float]) -> dict[int, int]:
-    """Index of the value nearest to each percentile; a value that is nearest to several serves the
-    middle one."""
+    """Index of the value nearest to each percentile; a value that is nearest to several percentiles
+    is used for the middle one."""
     order = np.argsort(values)
     places = {p: round(p / 100 * (len(order) - 1)) for p in (50, *PERCENTILES)}
     chosen: dict[int, int] = {}

@@ -60,9 +60,9 @@ from study import (
 SHAPES = ("encoder", *TUNED)
 LEADS, TRAILS = "CMA-ES leads", "CMA-ES trails"
 POINTS = 21
-"""On the line between two codes, its ends included."""
+"""Number of points on the line between two codes, including its ends."""
 RIDGE = 0.01
-"""Rise over the higher end, as a share of it, that counts as a ridge."""
+"""Least rise above the higher end, as a share of that end, that counts as a ridge."""
 
 Rows = Mapping[str, Any]
 
@@ -74,7 +74,7 @@ class Config(study.Config):
     test: TestSet = TestSet()
     frames: tuple[int, ...] = (1, 4, 8)
     examples: int = 1
-    """Chairs of either kind for each number of frames."""
+    """Number of chairs of either kind for each number of frames."""
     iterations: int = 350
     """Iterations of the long searches (paper: 350)."""
     candidates: int = 32
@@ -117,7 +117,7 @@ class Example(NamedTuple):
     frames: int
     kind: str
     lead: float
-    """IoU of CMA-ES over plain descent after short searches."""
+    """IoU of CMA-ES minus that of plain descent, after short searches."""
 
 
 def short_searches(prior: ShapePrior, config: Config) -> Rows:
@@ -142,7 +142,7 @@ def short_searches(prior: ShapePrior, config: Config) -> Rows:
 
 
 def leads(rows: Rows, frames: int, rival: str) -> dict[str, float]:
-    """IoU of CMA-ES over a rival's by chair."""
+    """IoU of CMA-ES minus that of a rival, for each chair."""
     scores = {name: row[str(frames)] for name, row in rows.items()}
     return {name: s["CMA-ES"]["iou"] - s[rival]["iou"] for name, s in scores.items()}
 
@@ -187,7 +187,7 @@ class Ends(NamedTuple):
 def search_long(
     chosen: Sequence[Example], prior: ShapePrior, config: Config, journal: Journal
 ) -> None:
-    """A row for every example that has none: all searches, and all from the end of each."""
+    """Add missing rows of examples: all searches, and all searches from the end of each one."""
     chairs = {one.name: one for one in subjects(config.test)}
     missing = [one for one in chosen if row_name(one) not in journal.rows]
     size = min(2 * config.examples, len(missing))
@@ -215,7 +215,7 @@ def row_name(one: Example) -> str:
 
 
 def seen(chair: Subject, frames: int) -> Case:
-    """The measurement of the first frames; earlier use has shown that the chair can be observed."""
+    """The measurement of the first frames; earlier steps have shown that the chair is usable."""
     model = load_object(chair.item)
     case = None if isinstance(model, Skipped) else observe(model, replace(SEEN, frames=(frames,)))
     if case is None:

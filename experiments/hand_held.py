@@ -1,14 +1,14 @@
-r"""Seats in a room, filmed by hand from close up: is the whole seat found, and is it said if not?
+r"""Seats in a room, filmed by hand from close up: is the whole seat found, or is there a warning?
 
     python experiments/hand_held.py --meshes cad_chairs/
 
-Each seat stands on a floor, before a wall, with a table next to it. The camera begins so close that
-the legs are out of view, moves back and then around, a little shaken, with a Kinect's noise; its
-poses are given, and one click shows the seat in the first frame. A seat is whole where all four
-sides of its box lie within 4 cm of the truth; a result is wrong where they, or its height, do not,
-and nothing may be wrong without a warning or a verdict other than good.
+Each seat stands on a floor, in front of a wall, with a table next to it. The camera begins so close
+that the legs are out of view, moves back and then around the seat, with a little shaking and a
+Kinect's noise. Its poses are given, and one click marks the seat in the first frame. A seat is
+whole if all four sides of its box lie within 4 cm of the truth. A result is wrong if a side or the
+height does not, and no result may be wrong without a warning or a verdict other than good.
 
-Results: experiments/results/hand_held.json, seat by seat: a run that was killed goes on.
+Results: experiments/results/hand_held.json, seat by seat: a killed run resumes.
 """
 
 import tempfile
@@ -41,7 +41,7 @@ from runs import earlier, spread
 RESULTS = Path(__file__).parent / "results"
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 NEAR = 0.04
-"""Metres within which a side of the box is right."""
+"""Largest error of a side of the box that counts as right, in metres."""
 T_WORLD_OBJECT = np.array([[0, 0, 1, 2], [0, 1, 0, 1], [-1, 0, 0, -3], [0, 0, 0, 1]], float)
 
 
@@ -52,7 +52,7 @@ class Config:
     meshes: Path = Path("cad_chairs")
     """Folder or archive of seats, +y up and +z in front."""
     seats: int = 24
-    """Number of seats, spread over all."""
+    """Number of seats, spread over all seats."""
     frames: int = 12
     results: Path = RESULTS
     smoke: bool = False
@@ -113,7 +113,7 @@ def _is_whole(sides: list[float]) -> bool:
 
 
 class Recorded(NamedTuple):
-    """A recording on disk, and the truth of it."""
+    """A recording on disk, and its ground truth."""
 
     folder: Path
     click: tuple[float, float]
@@ -187,7 +187,7 @@ def _in_a_room(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarray:
-    """Camera poses: close to the upper part, back until all is in view, and 110 degrees around."""
+    """Camera poses: near the upper part, back until all is visible, then 110 degrees around."""
     middle, (width, height, depth) = bounds.mean(axis=0), np.ptp(bounds, axis=0)
     radius = np.linalg.norm([width, height, depth]) / 2
     along = np.linspace(0, 1, frames)

@@ -1,9 +1,9 @@
-r"""What fills the hidden half of a chair best: four networks, small, at equal budget.
+r"""Which network fills the hidden half of a chair best? Four small networks at equal budget.
 
     jaxshape dataset --output data/chairs --count 4096
     python experiments/hidden_half.py --dataset data/chairs --meshes cad_chairs/
 
-Each network is trained from scratch on the same number of the same pairs:
+Each network is trained from scratch on the same pairs, and on the same number of them:
 
 - conditional VAE: a U-Net of F and M whose decoder takes a code too, so that the code describes the
   hidden part (the package's default, at its full size);
@@ -14,11 +14,11 @@ Each network is trained from scratch on the same number of the same pairs:
   G(lambda_0) in Eq. 7 and fill the composed shape, and the code of the auto-encoder of F and M is
   searched.
 
-They are judged on chairs that nobody trained on: IoU of the decoded shape, of the composed shape,
-and of the composed shape's filling in occluded voxels alone; before a search and after Adam.
+They are judged on chairs that no network was trained on: IoU of the decoded shape, of the composed
+shape, and of the composed shape in occluded voxels alone; before a search and after Adam.
 
-Results: experiments/results/hidden_half.json and .png. A network that is trained is kept in
-`--output`; one that was killed goes on from its checkpoint. Time: about an hour on two cores.
+Results: experiments/results/hidden_half.json and .png. Trained networks are kept in `--output`; a
+killed training resumes from its checkpoint. Time: about an hour on two cores.
 """
 
 import json
@@ -84,13 +84,13 @@ class Config:
     dataset: Path = Path("data/chairs")
     """Folder made by `jaxshape dataset`."""
     meshes: Path | None = None
-    """Folder of meshes to judge on; procedural chairs kept for tests where it is not given."""
+    """Folder of meshes to judge on; without it, procedural chairs kept for tests."""
     chairs: int = 78
     """Number of meshes or chairs."""
     output: Path = Path("out/hidden_half")
     """Folder of the training runs."""
     steps: int = 400
-    """Batches of 32 pairs for each network."""
+    """Number of batches of 32 pairs for each network."""
     iterations: int = 64
     """Steps of Adam."""
     bfloat16: bool = False
@@ -143,7 +143,7 @@ def record_of(folder: Path, settings: TrainConfig, prior: ShapePrior) -> dict[st
 
 
 def scores_of(grids: Grids, logits, case: Case, conditional: bool, fill_logits=None) -> Scores:
-    """Scores of a decoded shape, which fills itself unless other logits are given."""
+    """Scores of a decoded shape, which fills hidden voxels unless other logits are given."""
     filled = complete(
         grids,
         logits if fill_logits is None else fill_logits,

@@ -9,7 +9,7 @@
 
 makes 128 seats as PLY files, +y up and front along +z, in metres: 1 to 11 s each on one core. The
 generators come from Infinigen Indoors (Raistrick et al. 2024, BSD licence), +x front and +z up.
-This script needs nothing of jaxshape, and jaxshape nothing of it. The shipped weights are scored by
+This script does not depend on jaxshape, nor jaxshape on it. The shipped weights are scored by
 
     jaxshape evaluate --meshes data/infinigen --output infinigen.json
 """
@@ -34,7 +34,7 @@ GENERATORS = {
     "armchair": ArmChairFactory,
     "sofa": SofaFactory,
 }
-"""Each makes every fifth seat."""
+"""The generators; each makes every fifth seat."""
 
 
 def make_seat(kind: str, seed: int) -> trimesh.Trimesh:

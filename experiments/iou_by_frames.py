@@ -38,7 +38,7 @@ from study import (
 )
 
 CLOSE = 0.01
-"""IoU by which F may lie below CMA-ES and still be called its bound."""
+"""Largest IoU by which F may lie below CMA-ES and still count as its bound."""
 GRADIENTS = ("gradient descent", "Adam")
 
 

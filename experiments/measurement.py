@@ -1,12 +1,12 @@
-r"""What frames measure, as points in voxels (paper, Eq. 6) and as fused signed distances.
+r"""Measurements from frames, as points in voxels (paper, Eq. 6) and as fused signed distances.
 
     python experiments/measurement.py --meshes cad_chairs/
 
 The 78 CAD seats, seen by a Kinect's noisy frames along an orbit. F is compared with the true
-surface voxels; the oracle is F with its occluded voxels filled from the truth, the best that any
-prior could reach on top. Then the auto-encoder proposes a shape, Adam refines it in 60 steps, and
-measured and decoded shape are composed: from points by F and M, from distances by their
-probabilities, and with the mirror image as further evidence.
+surface voxels. The oracle is F with its occluded voxels filled from the truth, which is the best
+result that any prior could reach. Then the auto-encoder proposes a shape, Adam refines it in 60
+steps, and the measured and the decoded shape are composed: from points by F and M, from distances
+by their probabilities, and with the mirror image as further evidence.
 
 Results: experiments/results/measurement.json; seats that are done are kept.
 Time: 25 minutes on two cores.
@@ -62,7 +62,7 @@ class Config:
     """Settings of the experiment."""
 
     meshes: Path | None = None
-    """Folder of the CAD seats; procedural chairs kept for tests where it is not given."""
+    """Folder of the CAD seats; without it, procedural chairs kept for tests."""
     chairs: int = 78
     """Number of meshes or chairs."""
     camera: CameraName = "kinect"
@@ -221,7 +221,7 @@ def rounded(values: np.ndarray) -> list[float]:
 
 
 def means(journal: Journal) -> dict[str, dict[str, list[float]]]:
-    """Over chairs: `means[way][score]`, one for each number of frames."""
+    """Means over chairs: `means[way][score]`, one for each number of frames."""
     first = next(iter(journal.rows.values()))
     return {
         way: {

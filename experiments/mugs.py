@@ -6,9 +6,9 @@ writes 300 mugs as PLY files, +y up and the handle along +x, in metres; a few se
 
     python experiments/mugs.py --output data/mugs --weights out/mug/mug.safetensors
 
-draws docs/mugs.png: mugs held out of the training of these weights, as they are, as measured in
-four frames, as the encoder completes them, and as CMA-ES finds them. Expected: the picture there,
-with the IoUs under it; about a minute on two cores, most of it compiling.
+draws docs/mugs.png with mugs held out of the training of these weights: the true mesh, the
+measurement of four frames, the encoder's shape, and the shape that CMA-ES finds. Expected: this
+picture, with the IoUs under it; about a minute on two cores, most of it compiling.
 """
 
 from collections.abc import Callable
@@ -40,11 +40,11 @@ from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
 from study import SEARCH, SEEN
 
 AZIMUTH = -65.0
-"""View of the pictures, in degrees: the handle in profile, from the side that four frames do not
-see."""
+"""Azimuth of the pictures, in degrees: it shows the handle in profile, from the side that four
+frames do not see."""
 
 Profile = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
-"""Radius at a height, both in metres."""
+"""Function from a height to the radius there, both in metres."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def random_mug(seed: int) -> trimesh.Trimesh:
 
 
 def _body(height: float, wall: float, radius: Profile) -> trimesh.Trimesh:
-    """The outline of a cut from the axis outwards, up, over the rim and down again, revolved."""
+    """A body of revolution: its outline goes from the axis outwards, up, over the rim and down."""
     outer = np.linspace(0, height, 24)
     inner = np.linspace(height, wall, 24)
     outline = np.concatenate([

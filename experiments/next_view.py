@@ -1,14 +1,15 @@
-r"""Which view next? Composed IoU against the number of views, by four ways to choose them.
+r"""Next best view: composed IoU by the number of views, for four ways to choose the views.
 
     python experiments/next_view.py --meshes cad_chairs/
 
-CAD seats before a Kinect (with its noise) at 1.8 diagonals, true poses. Cameras: 252 that a person
-can reach (`jaxshape.mapping.views`). All ways begin with the same view, at 30 degrees elevation and
-a random azimuth. Then: next best view (the greatest expected drop in entropy), a regular orbit in
-steps of 45 degrees at 30 degrees elevation, random cameras, and the camera farthest from all
-earlier ones. Samples are 16 codes of the conditional prior, drawn anew after each view.
+CAD seats in front of a Kinect (with its noise) at a distance of 1.8 diagonals, true poses. The
+views are chosen among 252 cameras that a person can reach (`jaxshape.mapping.views`). All ways
+begin with the same view, at 30 degrees elevation and a random azimuth. The ways are: next best view
+(the greatest expected drop in entropy), a regular orbit in steps of 45 degrees at 30 degrees
+elevation, random cameras, and the camera farthest from all earlier ones. Samples are 16 codes of
+the conditional prior, drawn anew after each view.
 
-Results: experiments/results/next_view.json, .png and .svg; a seat that is done is not run again.
+Results: experiments/results/next_view.json, .png and .svg; a finished seat is not run again.
 Time: 40 minutes on two cores.
 """
 
@@ -64,20 +65,20 @@ class Config:
     meshes: Path = Path("cad_chairs")
     """Folder of the CAD seats, as experiments/cad_seats.py writes it."""
     seats: int = 78
-    """How many of them, spread over all."""
+    """Number of seats, spread over all seats."""
     views: int = 6
-    """Views of each seat, 2 or more."""
+    """Number of views of each seat, 2 or more."""
     samples: int = 16
-    """Plausible shapes by which views are chosen, 1 to 32."""
+    """Number of sampled shapes from which views are chosen, 1 to 32."""
     at_a_time: int = 6
-    """Seats that are rebuilt in one call."""
+    """Number of seats that are rebuilt in one call."""
     results: Path = RESULTS
     smoke: bool = False
-    """One seat and two views: does it run?"""
+    """A test run with one seat and two views."""
 
 
 class Seat(NamedTuple):
-    """A seat, the cameras around it, and what each way of choosing has seen."""
+    """A seat, the cameras around it, and the measurement so far for each way of choosing."""
 
     name: str
     mesh: Any

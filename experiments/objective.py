@@ -7,10 +7,11 @@ after 1, 4 and 8 frames of 24 procedural chairs and 16 CAD seats: the weight of 
 voxels (1 in the paper); alpha as printed, scaled, the same for all chairs, or scheduled over the
 search; the prior re-anchored to the refined shape after every quarter of the search; the codes
 themselves (paper) or whitened ones as coordinates. Unless named otherwise, the weight is 3, alpha
-as printed, the codes whitened. Weighing measured occupied voxels and the prior three times is the
-same as counting free space a third, which is the `balanced` objective. For each, the IoU of the
-decoded and of the composed shape. Where the search is cut into quarters, Adam starts afresh with
-each. Some variants are repeated with depth images that have the faults of a real sensor.
+as printed, the codes whitened. A threefold weight of measured occupied voxels and of the prior is
+the same as a third of the weight of free space, which is the `balanced` objective. Each variant is
+scored by the IoU of the decoded and of the composed shape. Where the search is cut into quarters,
+Adam restarts in each quarter. Some variants are repeated with depth images that have the faults of
+a real sensor.
 
 Results: experiments/results/objective.json, .png and .svg; finished chairs are kept.
 Time: 16 minutes on two cores.
@@ -61,9 +62,9 @@ class Residual:
     prior_scales: tuple[float, ...] = (1.0,)
     """Factors of alpha, one for each part of the search."""
     alpha_is_printed: bool = True
-    """Otherwise alpha is 1 for every measurement."""
+    """Whether alpha is that of Eq. 7; otherwise alpha is 1 for every measurement."""
     anchor_moves: bool = False
-    """The prior is the shape found so far, renewed with every part."""
+    """Whether the prior is the shape found so far, updated with every part of the search."""
     search: RefineConfig = RefineConfig()
 
 

@@ -2,9 +2,9 @@ r"""The table of the paper's claims in docs/paper.md, written from the results f
 
     python experiments/paper_table.py
 
-Every script of `SCRIPTS` leaves its claims, with the figures found here, in its results file. This
-one puts them into docs/paper.md, between the two comments that name it. `--check` only compares the
-page with the files.
+Every script of `SCRIPTS` writes its claims, with the figures found here, to its results file. This
+script puts them into docs/paper.md, between the two comments that name it. `--check` only compares
+the page with the files.
 """
 
 import json

@@ -4,18 +4,18 @@
 
 Compares 5,000 procedural chairs with two sets of real seats: CAD models (a folder of meshes, +y up,
 front along +z) and, if given, chairs put together from oriented boxes. All are turned into the same
-canonical grids of surface voxels, each axis filling the grid, and every statistic is one geometric
-estimator applied to all of them, so that its errors are the same everywhere.
+canonical grids of surface voxels, in which the seat fills each axis. Every statistic is one
+geometric estimator that is applied to all of them, so that its errors are the same everywhere.
 
 The file of box chairs holds `boxes` [n, 12] (centre, edge lengths, first axis, second axis) and
-`count` (boxes of each chair, in order), +y up, back at -z. They are boxes only, so they tell sizes,
+`count` (boxes of each chair, in order), +y up, back at -z. They are boxes only, so they show sizes,
 places and frequencies of parts, but not how round a part is.
 
-Expected, as mean IoU with the nearest: CAD seats 0.41 with procedural chairs and 0.38 with box
-chairs; box chairs 0.43 with procedural ones and 0.60 with others of their own, among which many are
-nearly the same; procedural chairs 0.49 with others of their own. About four minutes on one core;
-grids are kept in `--cache`, so that a second run takes one or two. Empty that folder after a change
-to the statistics of points.
+Expected mean IoU with the nearest neighbour: CAD seats 0.41 with procedural chairs and 0.38 with
+box chairs; box chairs 0.43 with procedural chairs and 0.60 with other box chairs, many of which are
+nearly the same; procedural chairs 0.49 with other procedural chairs. About four minutes on one
+core; grids are kept in `--cache`, so that a second run takes one or two. Empty that folder after a
+change to the statistics of points.
 """
 
 import hashlib
@@ -56,7 +56,8 @@ class Config:
     boxes: Path | None = None
     """An .npz of box chairs; without it, the CAD seats are the only reference."""
     chairs: int = 5_000
-    """Procedural chairs, of the seeds from 0; also how many box chairs stand against them."""
+    """Number of procedural chairs, with seeds from 0; also the number of box chairs in their place.
+    """
     cache: Path = Path("out/procedural_vs_real")
     """Folder that keeps the grids of each source."""
     output: Path = RESULTS / "procedural_vs_real.json"
@@ -64,7 +65,7 @@ class Config:
     write_boxes: Path | None = None
     """Only write the first --chairs of --boxes here, as meshes to train on for comparison."""
     smoke: bool = False
-    """Only 20 procedural chairs and as many box chairs."""
+    """A test run with 20 procedural chairs and as many box chairs."""
 
 
 # ------------------------------------------------------------------ sources
@@ -111,7 +112,8 @@ class Seats(NamedTuple):
     surface: Bool[np.ndarray, "seat x y z"]
     extents: Float[np.ndarray, "seat 3"]
     leg_thickness: Float[np.ndarray, " seat"]
-    """Over the seat's height from floor to top, as is the next; NaN where there is nothing."""
+    """Relative to the seat's height from floor to top, like the next; NaN where there are no legs.
+    """
     back_thickness: Float[np.ndarray, " seat"]
 
 
@@ -223,7 +225,7 @@ def seat_layer(surface: Bool[np.ndarray, "n x y z"]) -> Float[np.ndarray, " n"]:
 
 
 def grid_statistics(seats: Seats) -> dict[str, Float[np.ndarray, " n"]]:
-    """Numbers by seat; NaN where a seat has none, as the thickness of a back without a back."""
+    """Statistics of each seat; NaN if undefined, such as the thickness of a missing back."""
     surface, seat = seats.surface, seat_layer(seats.surface)
     above = surface & (Y > seat[:, None, None, None] + 2)
     occupied = surface.sum((1, 2, 3))
@@ -263,7 +265,7 @@ def enclosed(surface: Bool[np.ndarray, "n x y z"]) -> Bool[np.ndarray, "n x y z"
 def back_of(
     surface: Bool[np.ndarray, "n x y z"], seat: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Something well above the seat, in the rear half, on most of the middle columns."""
+    """Whether voxels lie well above the seat, in the rear half, in most of the middle columns."""
     behind = (surface & (Y > seat[:, None, None, None] + 4))[:, 8:24, :, REAR]
     return behind.any(axis=(2, 3)).mean(axis=1) >= 0.5
 
@@ -271,7 +273,7 @@ def back_of(
 def arms_of(
     surface: Bool[np.ndarray, "n x y z"], seat: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """On both sides, above the seat and before the back, something at least five voxels long."""
+    """Whether both sides have voxels over a length of five, above the seat, before the back."""
     over = Y - seat[:, None, None, None]
     beside = surface & (over > 2) & (over < 13) & (Z >= 12) & (Z < 28)
     left, right = beside[:, :8].any(axis=(1, 2)).sum(1), beside[:, -8:].any(axis=(1, 2)).sum(1)
@@ -295,7 +297,7 @@ def parts(seats: Seats) -> dict[str, Bool[np.ndarray, " n"]]:
 
 
 VOLUMINOUS = 0.4
-"""From this enclosed share of its box on, a seat counts as voluminous."""
+"""Enclosed share of its box above which a seat counts as voluminous."""
 
 
 # ------------------------------------------------------------------ comparisons
@@ -308,9 +310,9 @@ def nearest(
     same: bool = False,
     block: int = 512,
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """The highest IoU of each grid with any of the others, and with which.
+    """The highest IoU of each grid with any of the others, and the index of that other grid.
 
-    With `same`, the first seats are part of the second ones, and none is compared with itself.
+    With `same`, the first grids are part of the second ones, and no grid is compared with itself.
     """
     ever = those.any(axis=0)
     B = those[:, ever].astype(np.float32)
@@ -328,7 +330,7 @@ def nearest(
 
 
 def spread(values: Float[np.ndarray, " n"]) -> dict[str, float]:
-    """Mean and quantiles of the numbers that are there."""
+    """Mean and quantiles of the values that are not NaN."""
     known = values[~np.isnan(values)]
     if not len(known):
         return {}
@@ -340,8 +342,9 @@ def spread(values: Float[np.ndarray, " n"]) -> dict[str, float]:
 def compare(ours: Float[np.ndarray, " n"], real: Float[np.ndarray, " m"]) -> dict[str, float]:
     """Coverage of one distribution by another.
 
-    `covered`: share of the real values within our 1 to 99 %. `KS`: largest gap of the cumulative
-    distributions. `Wasserstein`: mean distance between them, in standard deviations of the real.
+    `covered`: share of the real values between our 1st and 99th percentile. `KS`: largest gap
+    between the cumulative distributions. `Wasserstein`: mean distance between them, in standard
+    deviations of the real values.
     """
     ours, real = ours[~np.isnan(ours)], real[~np.isnan(real)]
     if not (len(ours) and len(real)):
@@ -415,8 +418,8 @@ def nearest_neighbours(
 ) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """Coverage, realism and their yardsticks; and the ten CAD seats that are covered worst.
 
-    Box chairs are cut in two: as many as there are procedural chairs stand in for them, and the
-    others are covered by them, so that both families have the same chance.
+    Box chairs are split in two: as many as there are procedural chairs take their place in one
+    comparison, and the others have to be covered, so that both families have the same chance.
     """
     ours, cad = sources["procedural"], sources["CAD"]
     ious, which = {}, {}
@@ -499,7 +502,7 @@ def _plot_parts(ax: Any, results: dict[str, Any]) -> None:
 
 
 def _plot_nearest(ax: Any, ious: dict[str, np.ndarray]) -> None:
-    """Colour: which seats look for a neighbour; line: among which."""
+    """Colours show the seats that search for a neighbour, lines the seats to choose from."""
     for name, iou in ious.items():
         these, those = name.split(" to ")
         line = {"procedural": "-", "CAD": ":", "boxes": "--"}[those.removeprefix("other ")]
@@ -555,7 +558,7 @@ def _tidy(ax: Any) -> None:
 
 
 def write_box_chairs(config: Config) -> None:
-    """Box chairs as PLY files. They are research data: so are weights trained on them."""
+    """Write box chairs as PLY files. They are research data, and so are weights trained on them."""
     assert config.boxes and config.write_boxes
     config.write_boxes.mkdir(parents=True, exist_ok=True)
     for name, mesh in box_chairs(config.boxes, config.chairs):

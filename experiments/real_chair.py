@@ -6,9 +6,9 @@ r"""A real chair, keyframe by keyframe: measured, proposed, refined (paper, Fig.
 The recording of real_recording.py: the red kitchen of 7-Scenes, sequence 01, frames 0 to 265, every
 fifth; a slatted chair half hidden by a table. CMA-ES continues for 40 iterations after each
 keyframe, and for 100 at the end. This is done twice: with the given poses, and with the first pose
-alone and all others tracked. The true shape is unknown. The figures are the agreement with the
-measurement: the share of F's voxels that a shape explains, and the share of free voxels that it
-fills.
+alone and all others tracked. The true shape is unknown. So the figures tell only how well a shape
+agrees with the measurement: the share of F's voxels that the shape explains, and the share of free
+voxels that it fills.
 
 Results: experiments/results/real_chair.json, .png and .svg, which hold no pixel of the recording.
 The figure with images goes to out/real_chair/: the recording is for research alone, and is not to
@@ -110,7 +110,7 @@ def main(config: Config) -> None:
 def run(config: Config, recording: Recording) -> tuple[Journal, dict[str, Rebuilt]]:
     """Rebuild the chair each way, and write the results.
 
-    Nothing is rebuilt where the results of these settings are there, with all pictures.
+    Nothing is rebuilt if the results of these settings already exist, with all pictures.
     """
     prior, box = load_prior("chair-autoencoder"), read_box(config.box)
     search = RefineConfig(iterations=config.iterations, symmetry=False)
@@ -178,7 +178,7 @@ def _moment(progress: Progress, state: MapState, shape: Reconstruction) -> Momen
 
 
 def _finished(moments: Sequence[tuple[Moment, MapState]], box: Box) -> Rebuilt:
-    """The last moment takes the place of that before the long search."""
+    """The finished result; the moment after the long search replaces the one before it."""
     by_keyframes = {one.keyframes: one for one, _ in moments}
     last, state = moments[-1]
     T_world_camera = np.stack(

@@ -4,10 +4,11 @@ click.
     python experiments/real_recording.py --recording kitchen/frames \
         --box experiments/kitchen_chair_box.json --click 240 150
 
-The chair of the paper's figure on real data (real_cma_au), on a recording that anyone can get: the
-red kitchen of 7-Scenes, sequence 01, frames 0 to 265, every fifth: a slatted chair half hidden by a
-table. `given` takes the poses and the box. `first` takes the first pose and the box, and tracks the
-other frames. `click` gets only one pixel of the first frame: no pose, no box, no floor, no scale.
+The experiment of the paper's figure on real data (real_cma_au), on a recording that anyone can get:
+the red kitchen of 7-Scenes, sequence 01, every fifth of frames 0 to 265. It shows a slatted chair
+half hidden by a table. `given` takes the poses and the box. `first` takes the first pose and the
+box, and tracks the other frames. `click` gets only one pixel of the first frame: no pose, no box,
+no floor, no scale.
 
 Compared with the given poses: distance and angle between cameras, as root mean square and maximum,
 and how well depth images agree with each other under the given and under our poses (root mean
@@ -80,7 +81,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> tuple[dict[str, Any], dict[str, list[Panel]]]:
-    """Rebuild the object each way; figures, and pictures of the meshes."""
+    """Rebuild the object each way; return figures, and pictures of the meshes."""
     sequence, box, prior = (
         open_sequence(config.recording),
         read_box(config.box),
@@ -174,8 +175,8 @@ def _against_box(found: Box, given: Box) -> dict[str, Any]:
 
 
 def _depth_agreement(progress: Progress, sequence: Sequence) -> dict[str, float]:
-    """Distance of each keyframe from the surface of the previous one: with our poses, and with the
-    given."""
+    """Distance of each keyframe from the surface of the previous one, with our poses and with the
+    given poses."""
     keyframes = [log.index for log in progress.logs if log.status == "keyframe"]
     poses = trajectory(progress)
     ours, given = [], []

@@ -19,14 +19,14 @@ from jaxshape.search.config import RefineConfig
 
 
 def middle_pixel(shown: np.ndarray) -> tuple[float, float]:
-    """The pixel, u and v, nearest to the middle of all that are true: where to click."""
+    """The pixel to click, u and v: the true pixel nearest to the middle of all true pixels."""
     row, column = np.nonzero(shown)
     middle = np.argmin(np.hypot(row - np.median(row), column - np.median(column)))
     return float(column[middle]) + 0.5, float(row[middle]) + 0.5
 
 
 def usual() -> tuple[ShapePrior, Mapper]:
-    """The prior that places chairs, and the mapper, both as they are by default."""
+    """The default prior that places chairs, and the default mapper."""
     mapper = build_mapper(load_prior(), None, RefineConfig(), MappingConfig(), TrackingConfig())
     return load_prior("chair-autoencoder"), mapper
 
@@ -47,7 +47,7 @@ def rebuilt(
 
 
 def judgement(progress: Progress) -> dict[str, Any]:
-    """What the report says of a result: size, warnings, verdict, reasons, figures of quality."""
+    """The judgement of a result: size, warnings, verdict, reasons, figures of quality."""
     assert progress.shape is not None
     observation, one = observation_of(progress.state), only(progress.shape)
     found = shape_mesh(observation, one.composed, one.fill_logits)

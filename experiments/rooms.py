@@ -1,13 +1,13 @@
-r"""Rooms with several objects, filmed by hand: what is found, classed right and rebuilt?
+r"""Rooms with several objects, filmed by hand: are they found, classified correctly and rebuilt?
 
     python experiments/rooms.py --tables table.safetensors
 
-Each room has a floor, a wall, and 3 to 6 objects: procedural chairs and tables that nobody trained
-on, and things of neither class. A Kinect's noise, 320 x 240 pixels; given poses err by 4 mm and 0.3
-degrees. An object is found where its box overlaps the true one by a quarter. IoU is that of the
-mesh's voxels and the true ones, at 32 along each side of the true box.
+Each room has a floor, a wall, and 3 to 6 objects: procedural chairs and tables that no network was
+trained on, and objects of neither class. The images have a Kinect's noise and 320 x 240 pixels; the
+given poses err by 4 mm and 0.3 degrees. An object is found if its box overlaps the true one by a
+quarter. IoU compares the mesh's voxels with the true voxels, 32 along each side of the true box.
 
-Results: experiments/results/rooms.json, room by room, and rooms.png: a run that was killed goes on.
+Results: experiments/results/rooms.json, room by room, and rooms.png: a killed run resumes.
 """
 
 import json
@@ -45,7 +45,7 @@ from things import KINDS, thing
 RESULTS = Path(__file__).parent / "results"
 SHAPE, FOCAL = (240, 320), 262.5
 FOUND = 0.25
-"""Overlap of boxes from which an object is found."""
+"""Least overlap of its box with the true box for an object to be found."""
 
 
 @dataclass(frozen=True)
@@ -55,18 +55,18 @@ class Config:
     rooms: int = 24
     frames: int = 16
     tables: Path | None = None
-    """Weights for tables; None takes the class of chairs alone."""
+    """Weights for tables; None uses the class of chairs alone."""
     results: Path = RESULTS
     smoke: bool = False
-    """One room, few frames: does it run?"""
+    """A test run with one room and few frames."""
 
 
 class Placed(NamedTuple):
-    """An object of a room, in truth."""
+    """A true object of a room."""
 
     kind: str
     mesh: trimesh.Trimesh
-    """In its own frame, its box centred at the origin."""
+    """Mesh in its own frame, with its box centred at the origin."""
     T_world_object: np.ndarray
 
 
@@ -130,7 +130,7 @@ def one_room(number: int, frames: int, classes: SceneClasses) -> dict[str, Any]:
 
 
 def furnished(number: int) -> list[Placed]:
-    """The objects of a room: at least one chair, one table and one thing of neither class."""
+    """The objects of a room: at least one chair, one table and one object of neither class."""
     rng = np.random.default_rng(number)
     kinds = ["chair", "table", str(rng.choice(KINDS))]
     kinds += rng.choice(["chair", "table", *KINDS[:3]], number % 4).tolist()
@@ -186,7 +186,7 @@ def record(folder: Path, truth: list[Placed], frames: int, seed: int) -> None:
 
 
 def path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarray:
-    """Poses along an arc around a room, a little shaken."""
+    """Poses along an arc around a room, with a little shaking."""
     middle = bounds.mean(axis=0)
     radius = np.hypot(*np.ptp(bounds, axis=0)[[0, 2]]) / 2 + 0.9
     along = np.linspace(0, 1, frames)
@@ -214,7 +214,7 @@ def _shaken(T: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def matched(truth: list[Placed], scene: Scene) -> dict[int, SceneObject]:
-    """The object that each true one was found as."""
+    """The found object of each true object."""
     pairs = sorted(
         (
             (-box_overlap(_box(one), found.progress.start.box), i, k)
@@ -249,7 +249,7 @@ def box_overlap(a: Box, b: Box) -> float:
 
 
 def compared(one: Placed, found: SceneObject | None) -> dict[str, Any]:
-    """An object and what was found of it."""
+    """Figures of a true object, compared with the object that was found."""
     figures: dict[str, Any] = {"kind": one.kind, "found": found is not None}
     if found is None or found.decision is None:
         return figures
@@ -287,7 +287,7 @@ def mesh_iou(one: Placed, found: SceneObject) -> float:
 
 
 def summary(rooms: dict[str, Any]) -> dict[str, Any]:
-    """Means over all rooms, by class; yaw errors of tables are those to the nearest half turn."""
+    """Means over all rooms, by class; yaw errors of tables are modulo half a turn."""
     objects = [one for room in rooms.values() for one in room["objects"]]
     figures: dict[str, Any] = {"rooms": len(rooms), "objects": len(objects)}
     figures["false objects"] = sum(len(room["false"]) for room in rooms.values())
@@ -328,7 +328,7 @@ def _errors(kind: str, right: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def draw(rooms: dict[str, Any], path: Path) -> None:
-    """What each kind was taken for, and the IoU of those that were found."""
+    """Draw the decided class of each kind, and the IoU of the objects that were found."""
     objects = [one for room in rooms.values() for one in room["objects"]]
     kinds, classes = ["chair", "table", *KINDS], ["chair", "table", "None", "not found"]
     counts = np.zeros((len(kinds), len(classes)), int)

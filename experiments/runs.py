@@ -1,4 +1,4 @@
-"""What scripts share that go over many objects: which ones, and what an earlier run has done."""
+"""Common code of scripts that go over many objects: choose objects, and reuse earlier runs."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def spread(available: int, count: int) -> list[int]:
-    """Numbers of so many objects, spread over all that there are; all where there are no more."""
+    """Indices of `count` objects, spread over all available ones; all if there are not more."""
     return np.linspace(0, available - 1, min(count, available)).round().astype(int).tolist()
 
 

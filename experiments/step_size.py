@@ -49,7 +49,7 @@ from study import (
 
 CASES_AT_A_TIME = 15
 WORST = 99.0
-"""Stands for a loss that is not finite, which JSON does not have."""
+"""Value in place of a loss that is not finite, which JSON cannot hold."""
 
 
 class Trial(NamedTuple):
@@ -291,7 +291,7 @@ def papers_sigma(journal: Journal, config: Config) -> Claim:
 
 
 def papers_scales(journal: Journal, config: Config) -> Claim:
-    """Codes c times as long want c times the sigma0, and c^2 times the step."""
+    """Codes c times as long need c times the sigma0, and c^2 times the step."""
     sigma, step = (best_in(journal, config, method, "raw").step for method in ("CMA-ES", DESCENT))
     longer = PAPERS["CMA-ES"].step / sigma
     louder = longer**2 * step / PAPERS[DESCENT].step

@@ -34,7 +34,8 @@ from jaxshape.search.reconstruction import Reconstruction, reconstruct, refiner_
 RESULTS = Path(__file__).parent / "results"
 
 CASES_AT_A_TIME = 64
-"""Cases searched together, unless a chair has more: the rows between two entries of the journal."""
+"""Number of cases searched together, unless a chair has more: they are written to the journal
+together."""
 
 SEEN = EvaluateConfig(camera="paper", noise=False, fusion="points")
 """Camera and fusion of the paper: square images without noise, their points counted in voxels."""
@@ -62,7 +63,7 @@ class TestSet:
     chairs: int = 288
     """Procedural chairs, from seeds kept for tests (the paper has 288 of ShapeNet)."""
     seats: int = 78
-    """CAD seats at most."""
+    """Largest number of CAD seats."""
     meshes: Path = Path("cad_chairs")
     """Folder of the CAD seats, as experiments/cad_seats.py writes it."""
 
@@ -97,7 +98,7 @@ class Subject(NamedTuple):
 def subjects(test: TestSet) -> list[Subject]:
     """The chairs of a test set, mixed: a smaller set is part of a larger one.
 
-    `FileNotFoundError` where seats are asked for and there is no folder of meshes.
+    `FileNotFoundError` if seats are requested and there is no folder of meshes.
     """
     chairs = procedural_objects("chair", test.chairs, TEST_SEEDS)
     procedural = [Subject(chair.name, "procedural", chair) for chair in chairs]
@@ -162,7 +163,7 @@ def compare(
     noise: bool = False,
     at_a_time: int = CASES_AT_A_TIME,
 ) -> None:
-    """Run every contestant on every chair, after each number of frames, unless its row is there.
+    """Run every contestant on every chair, after each number of frames, unless its row exists.
 
     A row is `{"group": ..., frames: {contestant: scores}}`; `seconds` are added to the scores: the
     time of the batch without compilation, divided by its cases. All contestants draw the same
@@ -200,7 +201,7 @@ def compare(
 
 
 def _left(names: Iterable[str], chairs: Sequence[Subject], journal: Journal) -> list[str]:
-    """The contestants that some of the chairs have not met."""
+    """The contestants that have not run on all of the chairs."""
     rows = [journal.rows.get(one.name, {}) for one in chairs]
     met = [{name for k in row if k != "group" for name in row[k]} for row in rows]
     return [name for name in names if not all(name in one for one in met)]
@@ -272,7 +273,7 @@ def conclude(journal: Journal, claims: Iterable[Claim], **findings: Any) -> None
 
 
 def mean_low_high(values: Num[np.ndarray, " n"]) -> list[float]:
-    """The mean and the ends of its 95 % interval, as JSON has them."""
+    """The mean and the ends of its 95 % interval, as numbers for JSON."""
     return [_rounded(float(x)) for x in (values.mean(), *interval(values))]
 
 

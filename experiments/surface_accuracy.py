@@ -1,4 +1,4 @@
-r"""How far meshes lie from the true surface: fused and completed, of voxels, and Open3D's.
+r"""Distance of meshes from the true surface: fused and completed, from voxels, and from Open3D.
 
     python experiments/surface_accuracy.py --meshes cad_chairs/
 
@@ -48,7 +48,7 @@ from study import Claim, conclude, listed
 RESULTS = Path(__file__).parent / "results"
 DEVICE = CAMERAS["kinect"]
 SAMPLES, POINTS = 200_000, 15_000
-"""Points that stand for a surface, and points of which the distance to it is measured."""
+"""Number of points that represent a surface, and of points whose distance to it is measured."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Config:
     """Settings of the experiment."""
 
     meshes: Path | None = None
-    """Folder of the CAD seats; procedural chairs kept for tests where it is not given."""
+    """Folder of the CAD seats; without it, procedural chairs kept for tests."""
     every: int = 8
     """Take every n-th seat."""
     frames: tuple[int, ...] = (4, 18)
@@ -153,7 +153,7 @@ def _both(points: Float[np.ndarray, "n 3"], mesh: trimesh.Trimesh) -> list[float
 
 
 def distances(points: Float[np.ndarray, "n 3"], mesh: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
-    """Metres to the triangles that hold the nearest of many points on the surface."""
+    """Distance in metres to the triangles on which the nearest of many surface points lie."""
     sampled: Any = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
     samples, face = map(np.asarray, sampled)
     nearest = np.asarray(KDTree(samples).query(points, k=3)[1])
@@ -207,7 +207,7 @@ def open3d_mesh(captured: Capture) -> trimesh.Trimesh:
 
 
 def means(journal: Journal) -> dict[str, dict[str, list[float]]]:
-    """Over chairs: `means[frames][way]`, mean and 90th percentile in millimetres."""
+    """Means over chairs: `means[frames][way]`, mean and 90th percentile in millimetres."""
     rows = list(journal.rows.values())
     return {
         k: {
@@ -219,7 +219,7 @@ def means(journal: Journal) -> dict[str, dict[str, list[float]]]:
 
 
 def claims(journal: Journal) -> list[Claim]:
-    """The fused surface is nearer to the truth than that of voxels, and than Open3D's."""
+    """The claim that the fused surface is nearer to the truth than those of voxels and Open3D."""
     found = means(journal)
     ours = {k: ways["measured to CAD"][0] for k, ways in found.items()}
     others = {

@@ -12,7 +12,7 @@ KINDS = ("box", "plant", "lamp", "bin", "ball")
 
 
 def thing(kind: str, seed: int) -> trimesh.Trimesh:
-    """A thing of a kind, by seed."""
+    """An object of a kind, from a seed."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
     mesh = {"box": _box, "plant": _plant, "lamp": _lamp, "bin": _bin, "ball": _ball}[kind](rng)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))

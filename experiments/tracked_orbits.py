@@ -2,18 +2,18 @@ r"""Tracking and mapping of orbits without given poses: drift, and its effect on
 
     python experiments/tracked_orbits.py --meshes cad_chairs/
 
-32 CAD seats, a full orbit each of 36 frames 10 degrees apart, 240 x 240 pixels with a Kinect's
-noise from 1.2 diagonals away. Given: the first pose and the object's box. Four systems: tracked
-against the last keyframe only or against the map as well, keyframes realigned with the refined
-shape or not; for comparison, the shape with the true poses.
+32 CAD seats, each with a full orbit of 36 frames 10 degrees apart, 240 x 240 pixels with a Kinect's
+noise, at a distance of 1.2 diagonals. The first pose and the object's box are given. There are four
+systems: frames are tracked against the last keyframe only or against the map as well, and keyframes
+are realigned with the refined shape or not. For comparison, a fifth run uses the true poses.
 
 ATE is the root mean square, over the frames that were tracked, of the distance between the final
-and the true position of the camera, in mm: `ate` after the rigid motion that fits best, as is
-usual, `error` without any, for the first pose is given; in the figure `ate` as a share of the
-diagonal of the object's bounding box. IoU is given for the refined and the composed surface voxels
-after each keyframe.
+and the true position of the camera, in mm. `ate` is measured after the rigid motion that fits best,
+as is usual; `error` is measured without any motion, because the first pose is given. The figure
+shows `ate` as a share of the diagonal of the object's bounding box. IoU is given for the refined
+and the composed surface voxels after each keyframe.
 
-Results: experiments/results/tracked_orbits.json and .png; a seat that is done is not run again.
+Results: experiments/results/tracked_orbits.json and .png; a finished seat is not run again.
 Time: 15 minutes on two cores.
 """
 
@@ -71,7 +71,7 @@ class Config:
     meshes: Path = Path("cad_chairs")
     """Folder or archive of seats, +y up and +z in front."""
     seats: int = 32
-    """Number of seats, spread over all."""
+    """Number of seats, spread over all seats."""
     frames: int = 36
     step: float = 10.0
     """Degrees between frames."""
@@ -83,7 +83,7 @@ class Config:
     workers: int = 2
     results: Path = RESULTS
     smoke: bool = False
-    """One seat, few frames, in seconds, as a test."""
+    """A test run with one seat and few frames, which takes seconds."""
 
 
 def main(config: Config) -> None:
@@ -96,7 +96,7 @@ def main(config: Config) -> None:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Run every system on every seat, going on from earlier results of the same settings."""
+    """Run every system on every seat, and resume from earlier results of the same settings."""
     path = config.results / "tracked_orbits.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("results", "workers")}
     settings["meshes"] = config.meshes.name
@@ -188,7 +188,7 @@ def _follow(
 
 
 def _aligned(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Points after the rigid motion that brings them nearest to others (Umeyama, no scale)."""
+    """Points after the rigid motion that fits them best to the truth (Umeyama, no scale)."""
     centered = points - points.mean(axis=0)
     rotation = Rotation.align_vectors(truth - truth.mean(axis=0), centered)[0]
     return rotation.apply(centered) + truth.mean(axis=0)

@@ -12,12 +12,13 @@ and, for the variant that learns from real chairs made of boxes (research data),
         --boxes data/boxes
 
 For every variant of `VARIANTS` one network is trained from scratch on the same number of pairs. It
-is then judged on chairs that nobody trained on, procedural ones and meshes if any are given: by the
-IoU of the shapes of the first code, CMA-ES and Adam from 1, 4 and 8 frames of an orbit, by the
-ceiling of its space (codes fitted to the full truth), and by the first code's IoU from inputs with
-all faults at once. Training loss is not compared: the variants do not share one.
+is then judged on chairs that no network was trained on, procedural ones and, if given, meshes. The
+figures are the IoU of the shapes of the first code, CMA-ES and Adam from 1, 4 and 8 frames of an
+orbit, the ceiling of its code space (codes fitted to the full truth), and the first code's IoU from
+inputs with all faults at once. Training losses are not compared, because the variants have
+different losses.
 
-A variant that is finished is not run again; one that was killed goes on from its checkpoint.
+A finished variant is not run again; a killed one resumes from its checkpoint.
 Results: experiments/results/training_choices.json and .png. Time: about 2 minutes a variant on two
 quiet cores.
 """
@@ -58,7 +59,7 @@ FAULTY = DatasetConfig(
     noisy=1.0,
     faults=FaultConfig(pose_error=0.3, missing=0.3, segmentation=0.1, hidden=0.3, loose=1.0),
 )
-"""Inputs of the test of robustness: every fault, more of each than in training."""
+"""Inputs of the test of robustness: they have every fault, and more of each than in training."""
 
 # Each group changes one thing. The others of a group are compared with its first.
 PLAIN = replace(PRESETS["autoencoder"], architecture=SMALL, inputs=UNCHANGED, occupied_weight=1.0)
@@ -109,11 +110,11 @@ class Config:
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Variants to train; the figures of the others are kept."""
     steps: int = 200
-    """Batches of 32 pairs for each variant."""
+    """Number of batches of 32 pairs for each variant."""
     chairs: int = 12
     """Procedural test chairs."""
     meshes: Path | None = None
-    """Folder of meshes to judge on too."""
+    """Folder of meshes that variants are also judged on."""
     every: int = 3
     """Use every n-th of these meshes."""
     iterations: int = 40
@@ -122,7 +123,7 @@ class Config:
     """Folder of a dataset of box chairs; without it that variant is left out."""
     results: Path = RESULTS
     smoke: bool = False
-    """Tiny networks, one step: seconds, to see that it runs."""
+    """A test run with tiny networks and one step, which takes seconds."""
 
 
 # ------------------------------------------------------------------ one variant
@@ -132,7 +133,7 @@ Faulty = tuple[Grids, np.ndarray]
 
 
 def examples(name: str, config: Config) -> Dataset:
-    """Half of the objects, the same for all variants but the one that is about the objects."""
+    """Half of the objects, the same for all variants except the variant of box chairs."""
     if name == "box chairs":
         assert config.boxes is not None
         return open_dataset(config.boxes)
@@ -172,7 +173,7 @@ def faulty_pairs(models: Sequence[Model]) -> Faulty:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Train and judge every variant that has not been yet."""
+    """Train and judge every variant that is not finished yet."""
     path = config.results / "training_choices.json"
     found = json.loads(path.read_text()) if path.exists() and not config.smoke else {}
     chairs = loaded(procedural_objects("chair", config.chairs, TEST_SEEDS))

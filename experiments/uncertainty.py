@@ -1,20 +1,20 @@
-r"""Do probabilities come true? Reliability in occluded voxels, and what samples add.
+r"""Are probabilities reliable? Calibration in occluded voxels, and the gain from samples.
 
     python experiments/uncertainty.py --seats cad_chairs --tables cad_tables
 
-Shapes are completed from 1, 4 and 8 noisy frames of a Kinect along an orbit. Every way to say how
-sure a voxel is gets a calibration of its own, fitted to procedural chairs that nobody trained on
-and that are not in the test:
+Shapes are completed from 1, 4 and 8 noisy frames of a Kinect along an orbit. Every way to estimate
+the probability of a voxel has its own calibration, fitted to procedural chairs that are neither in
+the training nor in the test:
 
 - decoder: the logits of the shape, with slope and offset (Platt scaling);
 - conditional prior: the slope falls with the spread of 16 shapes whose codes are drawn from the
   conditional network's prior (the package's way);
-- auto-encoder, decoder: the same as the first, of the paper's network after 60 steps of Adam;
+- auto-encoder, decoder: like the first way, for the paper's network after 60 steps of Adam;
 - auto-encoder, curvature: samples by Laplace's approximation from the Gauss-Newton matrix;
 - auto-encoder, CMA-ES: samples from the covariance matrix C of CMA-ES after 60 generations, scaled
   by the factor among three that makes the calibration chairs most probable.
 
-The auto-encoder's rows are of 4 frames and of fewer objects, for each takes a search.
+The auto-encoder's rows use 4 frames and fewer objects, because each object takes a search.
 
 Results: experiments/results/uncertainty.json, .png and uncertainty_hypotheses.png.
 Time: about half an hour on two cores.
@@ -56,9 +56,9 @@ FRAMES = (1, 4, 8)
 SEEN = EvaluateConfig(frames=FRAMES, camera="kinect", noise=True)
 SAMPLES, STEPS = 16, 60
 FIRST_SEED = 500_000
-"""Seed of the first chair that calibrations are fitted to: between training and test."""
+"""Seed of the first chair that calibrations are fitted to: between the training and test seeds."""
 SCALES = (0.1, 0.3, 1.0)
-"""Factors of CMA-ES's matrix, whose own scale has shrunk by the end of a search."""
+"""Factors of CMA-ES's covariance matrix, which has shrunk by the end of a search."""
 AT_A_TIME = 6
 
 
@@ -73,7 +73,7 @@ class Config:
     calibration: int = 48
     """Procedural chairs that calibrations are fitted to."""
     searched: int = 12
-    """Calibration chairs and CAD seats of the auto-encoder's rows."""
+    """Number of calibration chairs and of CAD seats in the auto-encoder's rows."""
     weights: Path | None = None
     """Weights of the conditional network; those of the package where not given."""
     output: Path = RESULTS
@@ -226,7 +226,7 @@ def searched(seats: list, chairs: list) -> dict[str, Any]:
 
 
 def two_kinds(config: Config, cases: list[tuple[str, Case]], path: Path) -> str:
-    """Draw the object whose hypotheses differ most after one frame, and their blurred mean."""
+    """Draw the object whose hypotheses differ most after one frame, with their blurred mean."""
     prior, search = load_prior(config.weights), RefineConfig(samples=SAMPLES)
 
     @jax.jit
@@ -264,7 +264,7 @@ def two_kinds(config: Config, cases: list[tuple[str, Case]], path: Path) -> str:
 
 
 def plot(figures: dict[str, Any], path: Path) -> None:
-    """Reliability curves: what came true against what was said."""
+    """Reliability curves: observed frequency against predicted probability."""
     figure = Figure(figsize=(3.4 * len(FRAMES), 3.2 * len(figures)), layout="constrained")
     panels = figure.subplots(len(figures), len(FRAMES), squeeze=False, sharex=True, sharey=True)
     for row, (name, by_frames) in zip(panels, figures.items(), strict=True):

@@ -2,14 +2,14 @@ r"""IoU by number of frames on voluminous chairs alone (paper, Fig. true_false).
 
     python experiments/voluminous.py --test.meshes cad_chairs/
 
-Of the 288 procedural chairs and 78 CAD seats, the surface of 19 and 4 encloses more than 0.35 of
-the grid, its own voxels included. Otherwise as in iou_by_frames.py: encoder, descent, Adam and
-CMA-ES with equal iterations from 1 to 18 frames, and F with all occluded voxels set to empty and to
-full. The searches are the rows of iou_by_frames.py, which runs first where it has not been run.
+The surfaces of 19 of the 288 procedural chairs and of 4 of the 78 CAD seats enclose more than 0.35
+of the grid, their own voxels included. The rest is as in iou_by_frames.py: encoder, descent, Adam
+and CMA-ES with equal iterations from 1 to 18 frames, and F with all occluded voxels set to empty
+and to full. The searches are the rows of iou_by_frames.py, which runs first if it has not been run.
 
-The share of empty voxels among the occluded ones, which makes that bound good, is given for true
-surfaces, as everywhere here, and for solids, with everything that a surface encloses. No camera can
-see the inside; whether it is empty depends on the definition of a shape.
+The share of empty voxels among the occluded ones makes that bound good. It is given for true
+surfaces, as everywhere here, and for solids, which include everything that a surface encloses. No
+camera can see the inside; whether it is empty depends on the definition of a shape.
 
 Results: experiments/results/voluminous.json, .png and .svg; finished chairs are kept.
 Time: less than a minute on two cores after iou_by_frames.py.
@@ -64,7 +64,7 @@ class Config(iou_by_frames.Config):
     """Settings of the experiment."""
 
     enclosed: float = 0.35
-    """Fraction of the grid that a voluminous chair encloses at least."""
+    """Least fraction of the grid that a voluminous chair encloses."""
 
 
 def main(config: Config) -> None:
@@ -109,7 +109,7 @@ def voluminous(test: TestSet, least: float) -> Iterator[Subject]:
 
 @jax.jit
 def solid(surface: Bool[Array, "*batch x y z"]) -> Bool[Array, "*batch x y z"]:
-    """A surface with everything inside it: all voxels that no path of free voxels joins to the
+    """A surface with everything inside it: all voxels that no path of free voxels connects with the
     outside."""
     batch = surface.ndim - 3
     free = jnp.pad(~surface, [(0, 0)] * batch + [(1, 1)] * 3, constant_values=True)
