@@ -17,8 +17,8 @@ class TrackingConfig:
     Attributes:
         against: Align with the last keyframe and the surface of the map, or with the keyframe
             alone.
-        on: Align all pixels, where the camera moves through a still room; or those of the object,
-            where it turns before a still camera.
+        on: Align all pixels, if the camera moves through a still room; or the pixels of the object,
+            if the object turns in front of a still camera.
         min_inliers: Share of the points expected to be seen again that must agree, from 0 to 1.
         sure_inliers: Share of the same points below which many other guesses are tried, from 0 to
             1: wrong poses explain up to that much.

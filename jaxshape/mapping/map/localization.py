@@ -109,7 +109,7 @@ def _tracked_pixels(
     T_expected: jaxlie.SE3,
     config: TrackingConfig,
 ) -> Bool[Array, "h w"]:
-    """Pixels that are aligned: all, or those of the objects."""
+    """Pixels that are aligned: all pixels, or the pixels of the objects."""
     if config.on == "scene":
         return jnp.ones_like(prepared.masked)
     found = [object_pixels(prepared, one.place, T_expected) for one in states]

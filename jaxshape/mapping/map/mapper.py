@@ -90,7 +90,7 @@ def build_mapper(
         mapping: When a frame becomes a keyframe, and how keyframes are fused.
         track: How the pose of a frame is found, and when it is believed.
         seed: Seed of the random numbers of the search, 0 or more.
-        is_searched: Whether shapes are searched; False keeps what was measured, and no shape.
+        is_searched: Whether shapes are searched; False keeps only the measurement.
 
     Returns:
         The four functions over the state of a map.

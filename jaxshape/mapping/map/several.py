@@ -68,7 +68,7 @@ class Parts(NamedTuple):
         run_long: The search at the end.
         mapping: Settings of mapping.
         tracking: Settings of tracking.
-        is_searched: Whether shapes are searched; False leaves an object as it was measured.
+        is_searched: Whether shapes are searched; False keeps only the measurement.
     """
 
     prior: ShapePrior

@@ -61,7 +61,7 @@ _ROOM = 0.15  # share by which an estimated box is enlarged before it cuts out t
 
 
 class Start(NamedTuple):
-    """The object as it was found in one frame, the first of the map.
+    """The object that was found in the first frame of the map.
 
     Attributes:
         index: Number of the frame in the recording, from 0.

@@ -94,7 +94,7 @@ def _through_ball(
 
 
 def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Array, " k"]:
-    """Indices drawn with replacement, in proportion to their weights; those of weight 0 never.
+    """Indices drawn with replacement, in proportion to their weights; never one of weight 0.
 
     Weights are whole numbers, because rounding in a running sum would let any index be drawn.
     """

@@ -42,7 +42,7 @@ class Predicted(NamedTuple):
 
 
 def hidden_parts(resolution: int) -> Bool[np.ndarray, "part x y z"]:
-    """Parts of a grid that are hidden in turn: halves, and blocks like those of a chessboard.
+    """Parts of a grid that are hidden in turn: halves, and the blocks of a 3D chessboard.
 
     Args:
         resolution: Voxels along each axis.

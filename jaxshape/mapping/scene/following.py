@@ -48,7 +48,7 @@ class SceneObject(NamedTuple):
 
     Attributes:
         thing: Its number, and the cells that it fills.
-        progress: Its map and its box; logs are those of the scene.
+        progress: Its map and its box; its logs are the logs of the scene.
         decision: Its class and how sure that is; None before it was decided.
     """
 

@@ -30,7 +30,7 @@ SURE_FLOOR = 0.5
 
 
 class Shown(NamedTuple):
-    """A keyframe, and what it shows besides floor and walls.
+    """A keyframe, and its pixels that show neither floor nor walls.
 
     Attributes:
         view: The keyframe, with the pixels of all things.
@@ -66,7 +66,7 @@ class Look(NamedTuple):
         return self.pixels_in(thing, self.new)
 
     def pixels_in(self, thing: Thing, keyframe: Shown) -> Bool[np.ndarray, "h w"]:
-        """The pixels of a keyframe that show an object: those in its cells, or with its number.
+        """The pixels of a keyframe that show an object: pixels in its cells, or with its number.
 
         Args:
             thing: The object.
@@ -141,7 +141,7 @@ def shown(keyframes: Sequence[Keyframe]) -> list[Shown]:
 
 
 def _associated(views: Sequence[Shown], level: Level, tracks: Tracks) -> Tracks:
-    """The objects: those that masks number, or else the clusters of the room."""
+    """The objects: the numbered objects of masks if there are any, else clusters of the room."""
     if not any(one.parts.are_numbered for one in views):
         cells = cells_of([one.view for one in views], level)
         return associate(tracks, clusters_of(cells, level))

@@ -1,4 +1,4 @@
-"""What stands in a room, from all keyframes at once: cells of space, and their clusters. [host]
+"""The objects in a room, from all keyframes at once: cells of space, and their clusters. [host]
 
 A single frame separates things that belong together, and joins things that only look close. So the
 points of all keyframes are put into cells of a grid of the world. A cell is dropped if more

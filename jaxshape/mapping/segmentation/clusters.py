@@ -303,7 +303,7 @@ def corners(labels: Int[np.ndarray, "h w"], view: Scene) -> list[int]:
 
 
 def groups(labels: Int[np.ndarray, "h w"], view: Scene) -> list[list[int]]:
-    """The largest clusters, each with those that belong to it and to no larger one."""
+    """The largest clusters, each with the clusters that belong to it and to no larger one."""
     sizes = np.bincount(labels.ravel())[1:]
     found, left = [], labels.copy()
     for seed in np.argsort(-sizes, kind="stable")[: 4 * MOST] + 1:

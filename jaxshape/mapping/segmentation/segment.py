@@ -45,7 +45,7 @@ class Segmentation(NamedTuple):
         core: True on those among them that were chosen, without the clusters that were joined to
             them `[h w]`: other frames may show that these are something else.
         confidence: Confidence in the segmentation, from 0 to 1.
-        reason: One sentence: what was found, and what makes it unsure.
+        reason: One sentence that names the clusters found and the strongest doubt.
     """
 
     segmented: Bool[np.ndarray, "h w"]

@@ -143,7 +143,7 @@ def keyframe_of(
         T_world_camera: Pose of the frame.
         odometry: Its pose relative to the keyframe before, and the inverse covariance of that pose;
             None for the first.
-        segmented: The object's pixels; None for those in its box.
+        segmented: The object's pixels; None for all pixels in its box.
 
     Returns:
         The keyframe.
