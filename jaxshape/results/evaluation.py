@@ -129,8 +129,8 @@ def evaluate(
         config: Settings of the evaluation.
 
     Yields:
-        The scores of each mesh, as they go under `per_mesh` into the results file; a mesh of which
-        nothing was measured is `Skipped`.
+        The scores of each mesh, as written under `per_mesh` in the results file; a mesh without any
+        measurement is `Skipped`.
     """
     run, fit = by_each_method(prior, config), jax.jit(fit_surface)
     group = max(1, OBJECTS_AT_A_TIME * jax.local_device_count() // len(config.frames))
@@ -172,7 +172,7 @@ def by_each_method(
 ) -> Callable[..., dict[str, Reconstruction]]:
     """A compiled `reconstruct` by every method.
 
-    All methods are in one program, where XLA computes only once what they have in common: the first
+    All methods are in one program, in which XLA computes their common parts only once: the first
     code, its decoded shape and the target.
 
     Args:

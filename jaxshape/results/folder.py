@@ -1,4 +1,4 @@
-"""The content of a result folder, as far as it is there, for the report and the viewer. [host]
+"""The available content of a result folder, for the report and the viewer. [host]
 
 A folder may be old, half written, or rewritten at this moment: missing files are left out, and
 `problems` names the files that cannot be read.
@@ -92,7 +92,7 @@ class ObjectBox(NamedTuple):
 
 
 def read_folder(folder: str | os.PathLike[str]) -> ResultFolder:
-    """Read a folder made by `demo` or `reconstruct`, finished or not, as far as it is there.
+    """Read all available files of a folder made by `demo` or `reconstruct`, finished or not.
 
     Without a grid the object frame is not known; that of a scene's first object takes its place, or
     else the frame of the first keyframe, turned upright.

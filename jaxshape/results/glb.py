@@ -1,4 +1,4 @@
-"""Meshes to one GLB file: a node for each object, with its pose and what is known of it. [host]"""
+"""Write meshes to one GLB file: a node for each object, with its pose and its data. [host]"""
 
 import os
 from collections.abc import Sequence

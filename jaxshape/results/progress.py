@@ -165,7 +165,7 @@ def _fused(progress: Progress) -> Iterator[tuple[FrameLog, Keyframe]]:
 
 
 def write_pictures(folder: Path, sequence: Sequence, progress: Progress) -> None:
-    """Colour, depth and mask of each keyframe, at working size; those that are there stay.
+    """Write colour, depth and mask of each keyframe at working size; existing pictures stay.
 
     Args:
         folder: The folder of the pictures.

@@ -132,7 +132,7 @@ def write_mesh(
 
 
 class MeshFile(NamedTuple):
-    """A mesh as it was written.
+    """The content of a mesh file.
 
     Attributes:
         mesh: Its vertices and faces.
