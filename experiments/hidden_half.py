@@ -179,7 +179,7 @@ def contest(
 
 
 def cases(config: Config, camera: str) -> Iterator[tuple[str, Case]]:
-    """Each chair after each number of frames; chairs of which nothing was measured are left out."""
+    """Each chair after each number of frames; chairs without any measurement are left out."""
     name, noise = CAMERAS[camera]
     seen = EvaluateConfig(frames=FRAMES, camera=name, noise=noise)
     chairs = listed(config.meshes, config.chairs)[: config.chairs]

@@ -75,7 +75,7 @@ class Config:
     searched: int = 12
     """Number of calibration chairs and of CAD seats in the auto-encoder's rows."""
     weights: Path | None = None
-    """Weights of the conditional network; those of the package where not given."""
+    """Weights of the conditional network; the package's weights by default."""
     output: Path = RESULTS
     """Folder of the results."""
 
