@@ -216,9 +216,9 @@ def misfit(
 ) -> Float[Array, ""]:
     """Negative log-likelihood of the points given a shape in a box, in nats per point.
 
-    It sums three terms: the measured points, where the shape should be; the free points, where it
-    should not be, each a mean over points; and the size of the box. Differentiable in the logits
-    and in the box.
+    It sums four terms: the measured points, where the shape should be; the free points, where it
+    should not be; the measured points outside of the box; and the size of the box. The first three
+    are means over points. Differentiable in the logits and in the box.
     """
     n = logits.shape[-1]
     surface, free = to_voxels(box, seen.surface[:COMPARED_POINTS], n), to_voxels(box, seen.free, n)

@@ -52,9 +52,10 @@ class Tracks(NamedTuple):
 def associate(before: Tracks, clusters: Sequence[Cluster]) -> Tracks:
     """Data association: assign the clusters of the scene to the tracked objects.
 
-    An object is the cluster with which it shares most cells. Of two objects in one cluster the
-    larger one stays; of two clusters of one object the larger one is that object. Clusters that are
-    left over are new objects.
+    Pairs of an object and a cluster are formed in the order of the number of cells that they share.
+    So if a cluster covers two objects, the object with more cells in it stays; and if an object is
+    covered by two clusters, the one with more of its cells is that object. Clusters that are left
+    over are new objects.
 
     Args:
         before: The objects so far.

@@ -224,7 +224,7 @@ def nothing_below(plane: Plane, points: Float[np.ndarray, "n 3"]) -> float:
 def along_walls(planes: list[Plane]) -> Float[np.ndarray, " 3"] | None:
     """The vertical of a room whose floor is not seen: the direction that lies in two of its walls.
 
-    Any two large planes that meet at about a right angle count as walls if their line of
+    Any two large planes that meet at an angle of `CORNER` or more count as walls if their line of
     intersection is roughly upright in the image of a hand-held camera. Of several pairs, the one
     whose smaller wall holds most points is used.
 
