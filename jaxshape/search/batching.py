@@ -1,4 +1,4 @@
-"""Choices by a traced boolean: between trees, and branches that stay branches under `jax.vmap`."""
+"""Choices by a traced boolean: selection of pytrees, and branches that survive `jax.vmap`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,11 +9,12 @@ from jaxtyping import Array, Bool, PyTree
 
 
 def apply_if(due: Bool[Array, ""], function: Callable[..., Any], *operands: PyTree) -> PyTree:
-    """`function(*operands)` where `due`, else the operands as they are.
+    """Apply `function` to the operands where `due`; return them unchanged elsewhere.
 
-    A plain `lax.cond` turns into a select under `jax.vmap` and would do the work for every element
-    every time. Here a batch does it when ANY element is due, and keeps it where that element is.
-    `function` returns arrays of the same shapes as its operands, and closes over constants only.
+    Under `jax.vmap` a plain `lax.cond` turns into a select, which always calls the function for
+    every element. Here a batch calls the function only when ANY element is due, and each element
+    keeps the result only if it is due itself. `function` returns arrays of the same shapes as its
+    operands, and closes over constants only.
     """
 
     @jax.custom_batching.custom_vmap
@@ -43,5 +44,5 @@ def select(wanted: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
 
 
 def cast_like(new: PyTree, old: PyTree) -> PyTree:
-    """`new` with the types of `old`, as a loop wants them; for trees of the same shapes."""
+    """`new` with the types of `old`, as a compiled loop requires; for trees of the same shapes."""
     return jax.tree.map(lambda x, y: jnp.asarray(x, jnp.asarray(y).dtype), new, old)

@@ -18,7 +18,7 @@ SAMPLES = 16
 OBJECTS_AT_A_TIME = 8
 
 LEAST_OBJECTS = 16
-"""Fewer objects say too little of a calibration."""
+"""Smallest number of objects to which a calibration is fitted."""
 
 
 def fit_calibration(
@@ -29,15 +29,15 @@ def fit_calibration(
     samples: int = SAMPLES,
     seed: int = 0,
 ) -> Calibration | None:
-    """The calibration for which the true surfaces in occluded voxels are most probable. [host]
+    """Fit the calibration that makes the true surfaces in occluded voxels most probable. [host]
 
     Args:
-        prior: The shape prior; a calibration that it has is not used.
-        grids: F and M of objects that nobody trained on `[object x y z]`, after various numbers of
-            frames.
+        prior: The shape prior; its own calibration, if any, is ignored.
+        grids: F and M of objects outside the training set `[object x y z]`, fused from various
+            numbers of frames.
         surface: True surface voxels of the objects `[object x y z]`.
-        samples: Samples of the posterior, 2 or more; `RefineConfig.samples` should be about as
-            many.
+        samples: Samples of the posterior, 2 or more; choose a similar `RefineConfig.samples` for
+            searches.
         seed: Seed of the samples.
 
     Returns:

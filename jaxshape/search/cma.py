@@ -44,7 +44,7 @@ class CmaState(NamedTuple):
             decomposition.
         path_sigma: p_sigma `[d]`, the evolution path of the step size.
         path_c: p_c `[d]`, the evolution path of the covariance.
-        generation: Generations that the distribution has seen, from 0.
+        generation: Number of generations that have updated the distribution, from 0.
         history: Earlier generations, as far as the stop criteria need them.
     """
 
@@ -65,7 +65,7 @@ def checked_population(dim: int, sigma0: Float[Array, ""] | float, population: i
     """Check the settings of a search, and give its population.
 
     Args:
-        dim: Numbers in a point, 1 or more.
+        dim: Dimension of a point, 1 or more.
         sigma0: First standard deviation, above 0.
         population: Candidates per generation, 3 or more; None for pycma's default.
 
@@ -127,7 +127,7 @@ def start(
     population: int,
     loss: Float[Array, ""],
 ) -> CmaState:
-    """`cma_start` of a search that was built for `dim` numbers."""
+    """`cma_start` for a search in `dim` dimensions; it checks the shape of the point."""
     if point.shape != (dim,):
         raise ValueError(
             f"The point has shape {point.shape}; this search was built for ({dim},)."
@@ -205,9 +205,9 @@ def cma_tell(
 ) -> CmaState:
     """Move the distribution towards the better candidates (tutorial, Eqs. 41 - 47).
 
-    Only the order of the losses matters. Equal losses keep the order of the candidates, so that
-    a flat objective is random selection, under which the step size stays unbiased; NaN and
-    infinite losses rank last.
+    Only the order of the losses matters. Equal losses keep the order of the candidates: on a flat
+    objective selection is random, and the step size stays unbiased. NaN and infinite losses rank
+    last.
 
     Args:
         state: The distribution before this generation.
@@ -241,8 +241,9 @@ def cma_tell(
     path_c = (1 - c.c_c) * state.path_c + h_sigma * jnp.sqrt(
         c.c_c * (2 - c.c_c) * c.mu_eff
     ) * mean_step
-    lost = (1 - h_sigma) * c.c_c * (2 - c.c_c)  # variance the waiting path lacks
-    # A bad step is taken at the length sqrt(d), or one outlier could make C indefinite (Eq. 46).
+    lost = (1 - h_sigma) * c.c_c * (2 - c.c_c)  # variance that path_c misses while it waits
+    # Steps of negative weight are scaled to length sqrt(d): one outlier could make C indefinite
+    # (Eq. 46).
     length = jnp.linalg.norm(_sphere(state, steps), axis=-1)
     signed = jnp.where(weights < 0, weights * dim / (length + 1e-9) ** 2, weights)
     covariance = (
@@ -281,7 +282,7 @@ def _sphere(state: CmaState, steps: Float[Array, "*n d"]) -> Float[Array, "*n d"
 def _balanced(state: CmaState) -> CmaState:
     """The same distribution, with its scale moved from C into sigma before C under- or overflows.
 
-    A run without stopping can go that far: large populations shrink C instead of sigma.
+    A run without stop criteria can get there: large populations shrink C instead of sigma.
     """
     limits = jnp.finfo(state.sigma.dtype)
     size = jnp.trace(state.covariance) / len(state.mean)

@@ -11,7 +11,7 @@ from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.geometry.symmetry import NATS, mirrored, symmetrised
 
 LEARNT_NATS = 1.0
-"""Nats that a measured mirror image adds where the decoder has taken it into account already."""
+"""Nats that a measured mirror image adds when the decoder has already taken it into account."""
 
 
 class Composition(NamedTuple):
@@ -20,9 +20,9 @@ class Composition(NamedTuple):
     Attributes:
         composed: Measured voxels as measured, occluded voxels from the filling `[*batch x y z]`.
         logits: Logits of the filling `[*batch x y z]`.
-        symmetric: Whether the filling is mirrored `[*batch]`; None where that was not asked for.
+        symmetric: Whether the filling is mirrored `[*batch]`; None without `symmetry`.
         agreement: Share of the surface measured on both sides that agrees, 0 to 1 `[*batch]`; None
-            where that was not asked for.
+            without `symmetry`.
     """
 
     composed: Bool[Array, "*batch x y z"]
@@ -43,10 +43,11 @@ def complete(
     Args:
         grids: F and M of the objects `[*batch x y z]`, binary or soft.
         logits: Logits of their decoded shapes `[*batch x y z]`.
-        symmetry: Average each decoded shape with its mirror image, and add the evidence of the
-            other side, where the measured halves agree.
-        conditional: The decoder took the measurement (`ShapeModel.conditional`). Its answer then
-            counts where something was measured, too, and is mirrored in occluded voxels alone.
+        symmetry: If the measured halves of an object agree, average its decoded shape with the
+            mirror image and add the evidence of the other side.
+        conditional: The decoder took the measurement (`ShapeModel.conditional`). Its shape then
+            also counts in measured voxels, and only occluded voxels are averaged with the mirror
+            image.
     """
     seen, symmetric, agreement = from_grids(grids), None, None
     if symmetry:
@@ -66,9 +67,10 @@ def agreed(
 ) -> Bool[Array, "*batch x y z"]:
     """Combine the measurement with a decoder that was conditioned on it.
 
-    Points of a coarse camera make its rays pass through thin parts: of binary grids surface is kept
-    as it was measured, and free space is left to the decoder. Soft grids say how sure they are of
-    both: they count as much as the decoder.
+    With the points of a low-resolution camera, rays pass through thin parts. From binary grids only
+    the measured surface is kept, therefore, and the decoder decides about free space. Soft grids
+    contain the certainty of surface and free space: they are averaged with the decoder at equal
+    weight.
 
     Args:
         occupied: F `[*batch x y z]`, binary or soft.
@@ -96,7 +98,7 @@ def compose(occupied: Grid, occluded: Grid, completed: Grid) -> Bool[Array, "*ba
 
 
 def known_or(grids: Grids, completed: Grid) -> Float[Array, "*batch x y z"]:
-    """What was measured where something was, the completed shape elsewhere: (1 - M) F + M p.
+    """The measurement in measured voxels, the completed shape in occluded ones: (1 - M) F + M p.
 
     Args:
         grids: F and M `[*batch x y z]`, binary or soft.

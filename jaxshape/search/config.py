@@ -20,7 +20,7 @@ Space = Literal["whitened", "raw"]
 
 
 def objective_for(fusion: str) -> ObjectiveName:
-    """The objective that suits the grids of a way to fuse frames.
+    """The objective that suits the grids of a fusion method.
 
     Args:
         fusion: "distance", whose F and M are soft, or "points", whose F and M are binary.
@@ -32,14 +32,14 @@ def objective_for(fusion: str) -> ObjectiveName:
 class RefineConfig:
     """Settings of a search for the shape of an object.
 
-    All that are numbers and no counts may be traced by JAX, so that `jax.vmap` searches with many
-    values in one program (docs/examples/sweep.py); their values are then not checked.
+    Numbers that are not counts may be traced by JAX, so that `jax.vmap` searches with many values
+    in one program (docs/examples/sweep.py); traced values are not checked.
 
     Attributes:
         objective: The residual that is minimised: `paper` is Eq. 7 as printed; in `balanced`
             measured free space counts a third; in `soft` each voxel counts by how sure its
-            measurement is. None for `soft` where F and M are soft, as signed distances give them,
-            and `balanced` where they are binary.
+            measurement is. None selects `soft` if F and M are soft, as signed distances give them,
+            and `balanced` if they are binary.
         iterations: Steps of the search at most, 1 or more (paper: 350).
         population: Candidates per iteration of a population search, 3 or more (pycma's default for
             100 dimensions is 17).
@@ -52,16 +52,16 @@ class RefineConfig:
             space; None for no bounds.
         prior_weight: Weight of the codes' prior density, 0 or more: 1 adds the negative log-density
             of the code, under the training codes, to the objective.
-        tolerance: The search stops where the objectives of recent candidates differ by less than
+        tolerance: The search stops when the objectives of recent candidates differ by less than
             this, 0 or more, in nats per voxel; 0 never stops it.
-        target: The search stops where the objective is this low, in nats per voxel; None for no
-            target.
+        target: The search stops when the objective has fallen to this value, in nats per voxel;
+            None for no target.
         precision: Precision of the decoder's matrix products during the search, `float32` or
             `bfloat16`.
         symmetry: Fill the hidden part of one side of an object from its mirror image, where the
-            measured halves agree (not in the paper). The search itself is the same.
+            measured halves agree (not in the paper). It does not change the search itself.
         samples: Shapes to draw from the posterior of each object after its search, 0 or more; they
-            give the uncertainty of each voxel. A single one gives none.
+            give the uncertainty of each voxel. A single sample gives no uncertainty.
 
     Raises:
         ValueError: A setting is outside its range.

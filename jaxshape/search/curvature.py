@@ -5,8 +5,8 @@ of l, is positive semi-definite where l is convex. It is never formed: k product
 Lanczos directions Q, which span the Krylov space of the gradient, and the matrix in that space, T =
 Q^T (J^T H J) Q. A product takes about the time of a gradient.
 
-A search asks for it by `expand`. Objectives of `refine` and `js.objective` are `Composed`; of a
-plain function of JAX the Hessian takes the place of the Gauss-Newton matrix.
+A search obtains it from `expand`. Objectives of `refine` and `js.objective` are `Composed`; for a
+plain JAX function the Hessian replaces the Gauss-Newton matrix.
 """
 
 from collections.abc import Callable
@@ -62,7 +62,7 @@ class Composed:
 
 
 def only_where(wanted: Bool[Array, ""], objective: Objective) -> Objective:
-    """The objective where wanted; elsewhere it asks for points that are not finite, at no cost.
+    """Evaluate the objective only where wanted; elsewhere it gets NaN points, which cost nothing.
 
     Args:
         wanted: Whether to evaluate.
@@ -81,7 +81,7 @@ def expand(objective: Objective, point: Float[Array, " d"], directions: int) -> 
     Args:
         objective: The loss of one point: `Composed`, or any function that JAX can differentiate
             twice, whose Hessian may have negative curvature.
-        point: The point `[d]`. A loss that is not finite costs a `Composed` objective nothing.
+        point: The point `[d]`. A point that is not finite costs a `Composed` objective nothing.
         directions: Largest number of directions, 1 or more; d of them give the whole matrix.
 
     Returns:
@@ -101,18 +101,18 @@ def lanczos(
     first: Float[Array, "n d"],
     count: int,
 ) -> tuple[Float[Array, "n k d"], Float[Array, "n k k"]]:
-    """Orthonormal directions of the Krylov spaces of n symmetric matrices, and these among them.
+    """Orthonormal bases of the Krylov spaces of n symmetric matrices, and the matrices in them.
 
     Each direction is the matrix times the previous one, made orthogonal to all earlier ones. The
     orthogonalisation is done twice, because of rounding.
 
     Args:
-        product: n symmetric matrices times a vector each.
+        product: Multiplies each of the n symmetric matrices with a vector of its own.
         first: The vector that each space begins with.
         count: Directions, 1 or more.
 
     Returns:
-        The directions, of zeros once a space is exhausted, and the matrices T.
+        The directions, zero vectors once a space is exhausted, and the matrices T.
     """
     dot = lambda equation, *x: jnp.einsum(equation, *x, precision="highest")  # noqa: E731
 

@@ -1,8 +1,8 @@
 """Objects spread over devices. They share nothing, so that no device waits for another.
 
 `over_devices` is a `jax.shard_map` over all devices of the process, without a collective. It is
-part of `refine`, `reconstruct` and `evaluate`. Under a `jax.shard_map` of yours it does nothing,
-and in a mesh of yours it spreads the objects over that.
+part of `refine`, `reconstruct` and `evaluate`. Inside your own `jax.shard_map` it does nothing;
+inside your own mesh it spreads the objects over that mesh.
 """
 
 from collections.abc import Callable
@@ -31,15 +31,15 @@ def over_devices(
 ) -> PyTree:
     """`function(shared, rows)`, with the rows spread over devices.
 
-    Where devices cannot share the rows equally, some are worked out twice. The results of an eager
-    call, and of a `jax.jit` around it, lie on all these devices.
+    If the rows do not divide evenly among the devices, some rows are computed twice. The results of
+    an eager call, and of a `jax.jit` around it, lie on all these devices.
 
     Args:
         function: Pure; returns a tree of arrays with the same leading axis as the rows.
         shared: Tree of arrays, or of numbers, that all rows share.
-        rows: Tree of arrays with an axis over objects first.
+        rows: Tree of arrays whose first axis is over objects.
         devices: Number of this process's devices to use, 1 or more; None for all, or for the one on
-            which you have put an array. In a mesh of yours, it says nothing.
+            which you have put an array. It is ignored inside your own mesh.
 
     Raises:
         ValueError: `devices` is not a whole number, or is below 1.
@@ -58,7 +58,7 @@ def over_devices(
 
 
 def numbers(count: int) -> Int[Array, " object"]:
-    """Numbers of the objects of this device in the whole batch.
+    """Indices, in the whole batch, of the objects on this device.
 
     Copies that pad the last device are numbered after the objects of the batch.
 
@@ -70,9 +70,10 @@ def numbers(count: int) -> Int[Array, " object"]:
 
 
 def _mesh_of(rows: PyTree) -> tuple[AbstractMesh, tuple[str, ...]]:
-    """The mesh that is set, or that the type of an array names, and the axes to spread over.
+    """The current mesh, or the mesh in the type of an array, and the axes to spread objects over.
 
-    They are the axes that objects are spread over already, or all. Without a mesh it is empty.
+    The axes are those over which the objects are already spread, or else all axes of the mesh. If
+    there is no mesh, an empty one is returned.
     """
     mesh, first = jax.sharding.get_abstract_mesh(), None
     for x in jax.tree.leaves(rows):
@@ -96,7 +97,7 @@ def _spread(
     mesh: Any,
     axes: tuple[str, ...],
 ) -> PyTree:
-    """`function(shared, rows)`, with the rows filled up and spread over axes of a mesh."""
+    """`function(shared, rows)`, with the rows padded and spread over axes of a mesh."""
     count = len(jax.tree.leaves(rows)[0])
     number = prod(mesh.shape[axis] for axis in axes)
     size = -(-count // number) * number
@@ -104,13 +105,13 @@ def _spread(
     split, everywhere = PartitionSpec(axes), PartitionSpec()
 
     def place(tree, spec):
-        """Arrays of an explicit mesh are moved by hand."""
+        """Reshard the arrays of an explicit mesh, which JAX does not do by itself."""
         to = NamedSharding(mesh, spec)
         return jax.tree.map(lambda x: jax.sharding.reshard(x, to), tree) if explicit else tree
 
     if size > count:
         rows = jax.tree.map(lambda x: x[jnp.arange(size) % count], place(rows, everywhere))
-    # Searches of other packages loop over states that do not say where they differ.
+    # Searches of other packages have loop states that do not declare the mesh axes they vary over.
     spread = jax.shard_map(
         function, mesh=mesh, in_specs=(everywhere, split), out_specs=split, check_vma=False
     )

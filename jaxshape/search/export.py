@@ -1,8 +1,8 @@
 """A reconstruction compiled ahead of time: a program that another process runs without tracing it.
 
-The file holds the program for CPUs and for GPUs, but no weights: these are arguments. It is made
-for a number of objects at a time, since the memory of a search is bounded by it, and takes any
-number in batches of that.
+The file holds the program for CPUs and for GPUs, but no weights: these are arguments. It is
+exported for a fixed number of objects per batch, which bounds the memory of a search, and processes
+any number of objects in such batches.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,11 +39,11 @@ def export_reconstruct(
     soft: bool = True,
     platforms: Sequence[str] = PLATFORMS,
 ) -> bytes:
-    """Write `reconstruct` down as a program for other processes (`load_reconstruct`).
+    """Export `reconstruct` as a program for other processes (`load_reconstruct`).
 
     Args:
-        prior: The shape prior. The program takes any other of the same model and sizes.
-        refiner: The search (`refiner_for`); None lets the first code stand.
+        prior: The shape prior. The program accepts any other prior of the same model and sizes.
+        refiner: The search (`refiner_for`); None keeps the first code.
         config: Settings of the search.
         objects: Objects that are searched together, 1 or more.
         soft: Whether F and M are soft, as signed distances give them, or binary.
@@ -74,10 +74,10 @@ def export_reconstruct(
 
 
 def load_reconstruct(content: bytes) -> Callable[..., Reconstruction]:
-    """The program that `export_reconstruct` wrote down.
+    """Load a program that `export_reconstruct` has made.
 
-    It traces nothing and is compiled when it is first called, or found in JAX's cache of compiled
-    programs.
+    Nothing is traced. The program is compiled at its first call, or taken from JAX's cache of
+    compiled programs.
 
     Args:
         content: The content of the file.
@@ -102,7 +102,7 @@ def load_reconstruct(content: bytes) -> Callable[..., Reconstruction]:
         keys = jax.random.key_data(one_key_each(key, count))
 
         def batch(start: int) -> Any:
-            """The results of some objects; the last batch is filled up with its own first."""
+            """The results of one batch; the last batch is padded with its own objects."""
             some = jnp.arange(start, min(start + at_a_time, count))
             rows = some[jnp.arange(at_a_time) % len(some)]
             F, M = (jnp.asarray(x, grid.dtype)[rows] for x in (occupied, occluded))
@@ -116,7 +116,7 @@ def load_reconstruct(content: bytes) -> Callable[..., Reconstruction]:
 
 
 def _require_flatbuffers() -> None:
-    """Raise `ModuleNotFoundError` without the package by which JAX writes programs down."""
+    """Raise `ModuleNotFoundError` without the package that JAX needs to serialise programs."""
     if find_spec("flatbuffers") is None:
         raise ModuleNotFoundError(
             "Programs are written with flatbuffers, which is not installed:"

@@ -4,9 +4,9 @@
                                                group `jaxshape.methods`
     module:function, package.module:function[@variant]   any function that can be imported
 
-Behind every name is a function `build(variant, dim, config)`. It gives a `Refiner` over points of
-`dim` numbers with the settings of a `RefineConfig`, and raises `ValueError` for a variant that it
-does not know; without a variant, it is given None.
+Behind every name is a function `build(variant, dim, config)`. It returns a `Refiner` over points of
+dimension `dim` with the settings of a `RefineConfig`, and raises `ValueError` for a variant that it
+does not know; `variant` is None for a name without one.
 """
 
 import importlib
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 GROUP = "jaxshape.methods"
-"""Entry points that packages offer their searches by: NAME = "package.module:function"."""
+"""Group of the entry points by which packages offer searches: NAME = "package.module:function"."""
 
 Build = Callable[..., Any]
 
@@ -58,7 +58,7 @@ def find_build(name: str) -> tuple[Build, str | None]:
 
 
 def _own() -> list[str]:
-    """The modules of `methods/`, found as files; a name has - where the module has _."""
+    """The modules of `methods/`, found as files; the `_` of a module is a `-` in its name."""
     folder = Path(__file__).parent / "methods"
     return [module.name.replace("_", "-") for module in pkgutil.iter_modules([str(folder)])]
 

@@ -24,8 +24,8 @@ class ObjectTerms(NamedTuple):
     """The part of the objective that differs between objects; leading axes are batch axes.
 
     Attributes:
-        features: Features of its measurement, as the model prepared them.
-        target: Target of its residual.
+        features: Features of the object's measurement, prepared by the model.
+        target: Target of the object's residual.
         weight: Weight of the penalty.
     """
 
@@ -35,13 +35,14 @@ class ObjectTerms(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Scoring of codes, for any objects.
+    """Functions that score codes of any object.
 
     Attributes:
         loss: `(shared, code [d], own) -> loss`, under any `jax.vmap`s and `jax.grad`.
         shape: `(shared, codes [n d], own [m ...], owner [n]) -> logits [n x y z], losses [n]`.
-        expansion: `(directions, shared, code [d], own, chain [d d]) -> Expansion` in points, under
-            any `jax.vmap`s; `chain` is the Jacobian of the code by the point.
+        expansion: `(directions, shared, code [d], own, chain [d d]) -> Expansion` in coordinates of
+            the search space, under any `jax.vmap`s; `chain` is the Jacobian of the code with
+            respect to the point.
         shared: Arrays that all objects share: prepared parameters, and the constants of the
             residual and the penalty.
     """
@@ -102,7 +103,8 @@ def evaluation(
 
         found, pull = jax.vjp(decoded, jnp.zeros_like(codes))
         slopes, bend, losses = jax.vjp(slopes_of, *found, has_aux=True)
-        # J v is the transpose of the transpose: decoders need derivatives in reverse only.
+        # J v is computed as the transpose of the transpose: decoders need reverse-mode derivatives
+        # only.
         _, push = jax.vjp(
             lambda cotangents: pull(cotangents)[0], jax.tree.map(jnp.zeros_like, found)
         )
@@ -146,8 +148,8 @@ def objective(
 ) -> Callable[[Float[Array, " d"]], Float[Array, ""]]:
     """The objective of one object as a function of its code, for your own loop.
 
-    `jax.vmap` it over codes and, around this call, over objects: all of them still go through the
-    decoder a bounded number at a time.
+    `jax.vmap` it over codes and, around this call, over objects: the decoder still takes a bounded
+    number of codes at a time.
 
     Args:
         prior: The shape prior.
@@ -182,7 +184,7 @@ def objective(
 
 
 def prepare_one(prior: ShapePrior, grids: Grids | None, precision: Precision) -> Prepared:
-    """Prepare the one network of a search, as a constant of its derivatives.
+    """Prepare the single network of a search, without gradients to its parameters.
 
     Args:
         prior: The shape prior.

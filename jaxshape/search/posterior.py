@@ -1,12 +1,12 @@
-"""How sure a shape is: codes that explain what was measured as well, and what they agree on.
+"""Uncertainty of a shape, from samples of codes that explain the measurement equally well.
 
     codes  = sample_codes(keys, prior, grids, found, count)   # of the posterior of each object
     logits = decode(prior, codes, grids)                      # all of them in one call
     spread = logits.std(axis=1)                               # of the occupancy of each voxel
 
-Codes of a conditional model are normally distributed given what was measured: that is how it was
-trained. Codes of the others follow Laplace's approximation about the code that was found, whose
-precision is the prior's plus the curvature of the objective.
+In a conditional model, codes are normally distributed given the measurement, because the model was
+trained that way. In other models they follow Laplace's approximation about the code that was found:
+its precision is that of the prior plus the curvature of the objective.
 """
 
 import jax
@@ -21,8 +21,8 @@ from jaxshape.search.residuals import Residual
 from jaxshape.search.space import whitened
 
 DIRECTIONS = 20
-"""Directions in which the curvature of the objective is found; in the others a code is as
-uncertain as before the measurement."""
+"""Number of directions in which the curvature of the objective is computed; in all others a code is
+as uncertain as before the measurement."""
 
 
 def sample_codes(
@@ -88,9 +88,9 @@ def hypotheses(
 ) -> tuple[Int[Array, " count"], Float[Array, " count"]]:
     """The samples that differ most where nothing was measured, and how probable each is.
 
-    The first is the one nearest to all others; each further one is the farthest from those chosen
-    before, by the IoU of what they hold in unknown voxels. A mean of all samples would blur what
-    they disagree on, such as two kinds of legs.
+    The first is the sample nearest to all others; each further one is the sample farthest from
+    those chosen before. The distance is 1 - IoU of the occupied unknown voxels. A mean of all
+    samples would blur what they disagree on, such as two kinds of legs.
 
     Args:
         samples: Logits of samples of the posterior of one object `[sample x y z]`.
@@ -98,8 +98,8 @@ def hypotheses(
         count: Hypotheses, from 1 to the number of samples.
 
     Returns:
-        Numbers of the chosen samples `[count]`, and the share of all samples that each of them is
-        nearest to `[count]`, which sum to 1.
+        Indices of the chosen samples `[count]`, and for each of them the share of all samples to
+        which it is the nearest `[count]`; the shares sum to 1.
     """
     held = ((samples > 0) & unknown).reshape(len(samples), -1).astype(jnp.float32)
     both, size = held @ held.T, held.sum(axis=1)

@@ -47,9 +47,9 @@ def constants(
     """pycma's default constants for a dimension and a population (tutorial, Table 1).
 
     Args:
-        dim: Numbers in a point, 1 or more.
+        dim: Dimension of a point, 1 or more.
         population: Candidates per generation, 3 or more. It may be traced if `capacity` bounds it.
-        capacity: Length of the weights, static; weights behind the population are 0. None for the
+        capacity: Length of the weights, static; weights beyond the population are 0. None for the
             population itself.
         dtype: Type of the points.
     """

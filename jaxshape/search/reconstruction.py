@@ -30,14 +30,14 @@ class Reconstruction(NamedTuple):
     """Shapes of a batch of objects, from first code to composed grid.
 
     Attributes:
-        first_code: Code that the model proposes for what was measured `[object d]`.
+        first_code: Code that the model predicts from the measurement `[object d]`.
         code: Code that the search found `[object d]`.
         completed_first: The decoded first code, G(lambda_0) > 0.5 `[object x y z]`.
         logits: Logits of the refined shape `[object x y z]`.
         completed: The refined shape, G(lambda) > 0.5 `[object x y z]`.
-        composed: What was measured where something was, the filling elsewhere `[object x y z]`.
-        fill_logits: Logits of the filling `[object x y z]`: of the refined shape, averaged with its
-            mirror image and with what that showed where the object is symmetric.
+        composed: The measurement in measured voxels, the filling elsewhere `[object x y z]`.
+        fill_logits: Logits of the filling `[object x y z]`: the refined shape or, for a symmetric
+            object, its average with the mirror image plus the evidence measured on the other side.
         symmetric: Whether the filling is mirrored `[object]`; None without `config.symmetry`.
         agreement: Share of the surface measured on both sides that agrees, 0 to 1 `[object]`; None
             without `config.symmetry`.
@@ -47,11 +47,11 @@ class Reconstruction(NamedTuple):
         path: Best code so far after each iteration `[object iteration d]`; None without a search.
         iterations: Iterations that the search took `[object]`; None without a search.
         stop: Why the search ended `[object]`, as a `StopReason`; None without a search.
-        samples: Logits of shapes that explain what was measured as well as this one
+        samples: Logits of shapes that explain the measurement as well as this one does
             `[object sample x y z]`, filled as `fill_logits`; None without `config.samples`.
-        probability: Probability that each voxel is surface `[object x y z]`, from 0 to 1: measured
-            where something was, calibrated on the samples elsewhere; None without
-            `config.samples`.
+        probability: Probability that each voxel is surface `[object x y z]`, from 0 to 1: the
+            measurement in measured voxels, elsewhere calibrated with the spread of the samples;
+            None without `config.samples`.
     """
 
     first_code: Float[Array, "object d"]
@@ -77,8 +77,8 @@ def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner
     """The search of a method, for the codes of a prior.
 
     Args:
-        method: Name of the search (`build_refiner`), or "encoder" for no search: the first code
-            stands.
+        method: Name of the search (`build_refiner`), or "encoder" to keep the first code without a
+            search.
         prior: The shape prior whose codes are searched.
         config: Settings of the search.
 
@@ -94,14 +94,14 @@ def refiner_for(method: str, prior: ShapePrior, config: RefineConfig) -> Refiner
 
 
 def usual_method(prior: ShapePrior) -> str:
-    """The search that serves a prior best where none is asked for.
+    """The default search for a prior.
 
     Args:
         prior: The shape prior.
 
     Returns:
-        "encoder", no search, for a conditional model: its decoder knows what was measured, and the
-        codes that explain it better were no better in what was hidden. "cma" for others.
+        "encoder", no search, for a conditional model: its decoder takes the measurement, and codes
+        that explained the measurement better did not improve the hidden parts. "cma" for others.
     """
     return "encoder" if prior.model.conditional else "cma"
 
@@ -153,13 +153,15 @@ def reconstruct(
         prior: The shape prior.
         occupied: F of each object `[object x y z]`, binary or soft.
         occluded: M of each object `[object x y z]`, binary or soft.
-        refiner: The search (`refiner_for`); None lets the first code stand.
+        refiner: The search (`refiner_for`); None keeps the first code.
         config: Settings of the search.
         residual: The residual to minimise; None for the one that `config.objective` names.
-        earlier: Codes found when less was measured `[object d]`; the search starts from them where
-            they explain the grids better than the first code does. None starts from the first code.
-        data: Further arrays that your own model or residual needs of each object, as a pytree whose
-            arrays have a leading axis over objects: `grids.data` of `residual.target` and `encode`.
+        earlier: Codes found from earlier, less complete measurements `[object d]`; the search
+            starts from them if they explain the grids better than the first code does. None starts
+            from the first code.
+        data: Further arrays that your own model or residual needs for each object, as a pytree
+            whose arrays have a leading axis over objects; `residual.target` and `encode` get them
+            as `grids.data`.
         callback: `(objects [n], iterations [n], trace [n ...])`, called on the host after each
             iteration of the search (`refine`); None costs nothing.
         devices: Devices of this process to spread objects over, 1 or more; None for all.
@@ -242,7 +244,7 @@ def sampled(
     config: RefineConfig,
     residual: Residual,
 ) -> Reconstruction:
-    """A reconstruction with samples of the posterior, and with what they say of each voxel.
+    """Add samples of the posterior and the probability of each voxel to a reconstruction.
 
     Args:
         keys: One random key for each object `[object]`.
@@ -273,11 +275,11 @@ def reconstruct_jit(
 ) -> Callable[..., Reconstruction]:
     """`reconstruct` with a fixed search, compiled once for each number of objects.
 
-    Equal refiners, settings and residuals give the same function, which is then compiled already.
-    Samples are drawn by a program of their own, which leaves that of the search as it is without.
+    Equal refiners, settings and residuals give the same function, which is compiled only once. A
+    separate program draws the samples, so the program of the search does not depend on them.
 
     Args:
-        refiner: The search; None lets the first code stand.
+        refiner: The search; None keeps the first code.
         config: Settings of the search.
         residual: The residual to minimise; None for the one that `config.objective` names.
     """
@@ -304,10 +306,10 @@ def reconstruct_jit(
 def fit_surface(
     prior: ShapePrior, surface: Bool[Array, "object x y z"], *, iterations: int = 150
 ) -> Bool[Array, "object x y z"]:
-    """The shapes of the space nearest to complete surfaces: the ceiling of any reconstruction.
+    """The decoded shapes nearest to complete surfaces: the best that any reconstruction can reach.
 
-    Codes start where the model puts the complete surface and are fitted by Adam, in raw codes, to
-    the balanced cross-entropy with all of it.
+    Codes start at the encoding of the complete surface. Adam then fits them, in the raw space, by
+    the balanced cross-entropy with the complete surface.
 
     Args:
         prior: The shape prior.
@@ -326,7 +328,7 @@ def fit_surface(
     def fit(prior, surface):
         grids = Grids(surface, jnp.zeros_like(surface))
         found = refine(
-            jax.random.key(0),  # Adam draws no numbers
+            jax.random.key(0),  # Adam uses no random numbers
             prior,
             encode(prior, grids),
             jax.vmap(BALANCED.target)(grids, jnp.zeros(surface.shape)),
@@ -351,7 +353,7 @@ def require_batch(grids: Grids) -> None:
 
 
 def all_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> bool:
-    """Whether every grid has an occupied voxel, something to rebuild from."""
+    """Whether every grid has an occupied voxel, so that there is something to rebuild from."""
     return bool(np.asarray(occupied).any(axis=(-3, -2, -1)).all())
 
 

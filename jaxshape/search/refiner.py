@@ -137,7 +137,7 @@ def advance(
         refiner: The search.
         key: Random key of this iteration.
         state: The search's state.
-        trace: Trace of the iteration before.
+        trace: Trace of the previous iteration.
         objective: The loss of one point. A search that has stopped asks for points that are not
             finite.
 

@@ -7,7 +7,7 @@ A `Residual` is two pure functions of ONE object and ONE candidate; the search b
 
 The package has three: `PAPER` is Eq. 7 of the paper as printed, `BALANCED` is Eq. 7 with a third of
 the weight on measured free space, and `SOFT` is `BALANCED` with each voxel weighted by how sure its
-measurement is. Your own needs no more than these two functions (docs/examples/own_residual.py).
+measurement is. Your own residual needs only these two functions (docs/examples/own_residual.py).
 """
 
 import math
@@ -78,7 +78,7 @@ class Target(NamedTuple):
 def weigh(
     grids: Grids, first_logits: Float[Array, "*batch x y z"], weights: Weights = AS_PRINTED
 ) -> Target:
-    """The weights of Eq. 7: F where something was seen, alpha times the prior elsewhere.
+    """The weights of Eq. 7: F in measured voxels, alpha times the prior in occluded ones.
 
     Args:
         grids: F and M, binary or soft, `[*batch x y z]`.
@@ -87,8 +87,8 @@ def weigh(
 
     Returns:
         The target of `cross_entropy`. alpha is sum(M) / sum(1 - M), at least `weights.least_alpha`,
-        times `weights.prior`; where everything is occluded, the sum over no voxels counts as one,
-        so that the prior alone decides.
+        times `weights.prior`; if everything is occluded, the denominator is 1, so that the prior
+        alone decides.
     """
     axes = (-3, -2, -1)
     M = _as_weights(grids.occluded, first_logits)
@@ -138,8 +138,8 @@ def soft(weights: Weights = UNDER_NOISE) -> Residual:
     """Eq. 7 with each voxel weighted by how sure its measurement is.
 
     F and M are probabilities, as fused signed distances give them (`jaxshape.geometry.evidence`).
-    A voxel that is known with probability 0.5 pulls half as strongly towards its measured value,
-    and half towards the prior.
+    A voxel that is known with probability 0.5 counts half with its measured value, and half with
+    the prior.
 
     Args:
         weights: Weights of measured free space and of the prior; by default as in `BALANCED`, with

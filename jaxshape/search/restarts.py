@@ -39,8 +39,8 @@ class Run(NamedTuple):
     """Limits and spending of one run between two restarts.
 
     Attributes:
-        multiple: Population of the run, as a multiple of the first one: the iterations that a
-            generation takes.
+        multiple: Population of the run as a multiple of the first population; a generation takes as
+            many iterations.
         sigma0: First standard deviation of the run.
         is_small: Whether the run counts towards the small regime of BIPOP.
         iterations: Iterations spent.
@@ -104,7 +104,7 @@ def with_restarts(
     Args:
         kind: "ipop", which doubles the population at each restart, or "bipop", which spends as many
             evaluations on short runs with small populations.
-        dim: Numbers in a point, 1 or more.
+        dim: Dimension of a point, 1 or more.
         sigma0: First standard deviation, above 0, in units of the search space.
         population: Candidates per iteration and population of the first run, 3 or more; None for
             pycma's 4 + floor(3 ln dim).
@@ -205,7 +205,7 @@ def with_restarts(
         unknown = jnp.full_like(state.best.loss, jnp.inf)
         return state._replace(
             search=cma.start(point, run.sigma0, dim, size, unknown),
-            losses=jnp.full_like(state.losses, jnp.inf),  # settings of a larger population
+            losses=jnp.full_like(state.losses, jnp.inf),  # forgets those of a larger population
             mean=point,
             run=run,
             large_runs=large_runs,
@@ -221,7 +221,7 @@ def with_restarts(
 def _collect(
     state: RestartState, points: Float[Array, "n d"], losses: Float[Array, " n"], size: int
 ) -> RestartState:
-    """The state with the candidates of one more iteration in its generation."""
+    """Add the candidates of one iteration to the generation that is being collected."""
     run = state.run
     first = (run.iterations % run.multiple) * size
     write = jax.lax.dynamic_update_slice_in_dim

@@ -2,7 +2,7 @@
 
 `jax.vmap` over candidates, then over objects, would hand a decoder one axis per vmap and keep every
 candidate's grid in memory. Here each vmap only makes more rows, and rows are scored a bounded
-number at a time. Nothing here knows networks or residuals: a score is a function
+number at a time. Nothing here depends on networks or residuals: a score is a function
 
     score(shared, codes [n d], own [n ...]) -> pytree of [n ...]
 
@@ -27,8 +27,8 @@ from jaxshape.model.shapes import pick
 Score = Callable[[PyTree, Float[Array, "n d"], PyTree], PyTree]
 
 ROWS_AT_A_TIME = {"cpu": 8, "default": 1024}
-"""Rows scored together: on CPU enough for the matrix products of a decoder, otherwise a full
-device."""
+"""Rows scored together: on CPU enough for efficient matrix products, on other platforms enough to
+fill the device."""
 
 
 def loss_over_rows(
@@ -41,8 +41,8 @@ def loss_over_rows(
         at_a_time: Rows that are scored together, by platform.
 
     Returns:
-        `loss(shared, code, own)`, NaN at no cost for a code that is not finite. Differentiable in
-        the code; everything else is constant.
+        `loss(shared, code, own)`; a code that is not finite is not decoded and has the loss NaN. It
+        is differentiable in the code; everything else is constant.
     """
 
     def losses(shared, codes, own):
@@ -86,7 +86,8 @@ def over_rows(score: Score, at_a_time: Mapping[str, int] = ROWS_AT_A_TIME) -> Ca
     @scored.def_vmap
     def more_rows(size, batched, shared, codes, own, owner):
         shared_is, codes_are, own_is, owner_is = batched
-        # A branch under `jax.vmap`, as in a line search, copies constants for each element.
+        # A branch under `jax.vmap`, as in a line search, copies constants to each element: keep
+        # one.
         shared = jax.tree.map(lambda x, has_axis: x[0] if has_axis else x, shared, shared_is)
         n = owner.shape[-1]
         codes = codes if codes_are else jnp.broadcast_to(codes, (size, *codes.shape))
@@ -129,7 +130,7 @@ def of_one_row(
 
 
 def _by_chunks(score: Score, size: int, shared, codes, own, owner) -> PyTree:
-    """Score the rows `size` at a time; a chunk without a finite code is passed over.
+    """Score the rows `size` at a time; a chunk without a finite code is skipped.
 
     Rows whose code is not finite score NaN; they do not affect the other rows.
     """
@@ -150,7 +151,7 @@ def _by_chunks(score: Score, size: int, shared, codes, own, owner) -> PyTree:
 
 @custom_vmap
 def one_network(shared: PyTree) -> PyTree:
-    """The constants of a search, of which a batch has one for all: the identity.
+    """The identity, for constants of a search that all elements of a batch share.
 
     The constants are the network, and the arrays that a residual and a penalty close over.
 
@@ -173,13 +174,13 @@ def _refuse_networks(size: int, batched: PyTree, shared: PyTree) -> tuple[PyTree
 
 
 def hoisted(function: Callable[..., Array], *examples: Any) -> tuple[Callable[..., Array], Any]:
-    """Make the arrays that a function closes over its first argument.
+    """Turn the arrays that a function closes over into its first argument.
 
     A closure cannot pass through `over_rows`: its constants must be arguments.
 
     Args:
         function: Returns one array.
-        examples: Arguments of the shapes and types of later calls.
+        examples: Example arguments, with the shapes and types of later calls.
 
     Returns:
         `pure(constants, *arguments)`, and the constants.

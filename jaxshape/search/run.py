@@ -111,11 +111,12 @@ def refine(
         first_losses: Objectives of the first codes `[object]`, in nats per voxel; None where they
             are not known.
         target_loss: Objective that is low enough to stop, in nats per voxel; None for no target.
-        previous: The outcome of an earlier call with the same arguments, but for `iterations` and
-            `target_loss`: the search goes on as if it had not been interrupted. None begins.
+        previous: The outcome of an earlier call with the same arguments except `iterations` and
+            `target_loss`: the search goes on as if it had not been interrupted. None begins a new
+            search.
         warm_start: States of an earlier search in the same space (`Refined.state`), whose targets
-            have changed since: this search starts from them instead of from `codes`. Give other
-            keys, or it draws the same numbers again. None starts from `codes`.
+            have changed since: this search starts from them instead of from `codes`. Give different
+            keys, or it draws the same random numbers again. None starts from `codes`.
         callback: `(objects [n], iterations [n], trace [n ...])`, called on the host after each
             iteration while the compiled loop goes on, by each device for its objects; all are NumPy
             arrays. `jax.effects_barrier` waits for the last call. None costs nothing.
@@ -172,7 +173,7 @@ def refine(
 
 
 class _Begun(NamedTuple):
-    """Where the search of each object stands.
+    """Progress of the search of each object.
 
     Attributes:
         state: State of its refiner.
@@ -186,15 +187,14 @@ class _Begun(NamedTuple):
 
 
 def _begun(previous: Refined) -> _Begun:
-    """The states from which a search goes on; a search that had reached its target may get a lower
-    one."""
+    """The states from which searches go on; those that reached their target may get a lower one."""
     state, trace = previous.state, jax.tree.map(lambda x: x[:, -1], previous.trace)
     stop = jnp.where(state.stop == StopReason.TARGET, StopReason.RUNNING, state.stop)
     return _Begun(state._replace(stop=stop), trace, previous.iterations)
 
 
 class _Rows(NamedTuple):
-    """All that belongs to one object or another, with an axis over objects.
+    """The arrays that belong to single objects, with a leading axis over objects.
 
     Attributes:
         keys: Random key of each object.
@@ -224,7 +224,7 @@ class _Loop(NamedTuple):
         space: Coordinates of the search.
         own: Part of each object's objective that belongs to it alone.
         target_loss: Loss that is low enough to stop, or None.
-        callback: Hears of every iteration, or None.
+        callback: Function that is called after every iteration, or None.
     """
 
     refiner: Refiner
@@ -251,7 +251,7 @@ class _Loop(NamedTuple):
         return last.state, last.iterations, traces, path
 
     def first(self, rows: _Rows) -> _Begun:
-        """Where the searches begin, or stood."""
+        """The states at the start of the searches, or where they were interrupted."""
         if rows.begun is not None:
             begun = rows.begun
         else:
@@ -301,8 +301,8 @@ def _best(
 ) -> tuple[Float[Array, "object d"], Float[Array, "object x y z"], Float[Array, " object"]]:
     """Code, logits and objective of the best that each search has found.
 
-    Where a search stands at last was never evaluated: the mean of a population, or the point after
-    the last gradient step. It may be the better one.
+    The final mean of a search was never evaluated: it is the mean of a population, or the point
+    after the last gradient step. It may be better than the best candidate.
     """
     points = jnp.stack([states.best.point, states.mean], axis=1)
     codes = jax.vmap(jax.vmap(space.to_code))(points)

@@ -1,8 +1,8 @@
 """The coordinates in which codes are searched.
 
-Refiners know nothing of codes: they move a point u of `LatentSpace`, and the code is
-mean + root u. In the space whitened by the training codes u is a standard normal number in every
-direction, so that step sizes, bounds and tolerances mean the same for every network.
+Refiners do not handle codes: they move a point u of `LatentSpace`, and the code is mean + root u.
+In the space whitened by the training codes, u is standard normal in every direction, so that step
+sizes, bounds and tolerances mean the same for every network.
 """
 
 from typing import NamedTuple
@@ -42,10 +42,10 @@ class LatentSpace(NamedTuple):
         return self.mean + step
 
     def from_code(self, code: Float[Array, " d"]) -> Float[Array, " d"]:
-        """The point of a code; the nearest one inside where it lies outside the bounds.
+        """The point of a code; for a code outside the bounds, the nearest point inside.
 
-        Close to the bounds `to_code` moves it a little further in: at the very edge, where the
-        fold turns back, a gradient could not leave again.
+        Close to the bounds `to_code` maps this point slightly further inside. The point that maps
+        exactly to the bound is where the fold turns back, and a gradient method could not leave it.
 
         Args:
             code: A code `[d]`.
@@ -78,7 +78,7 @@ def whitened(prior: ShapePrior, bound: Float[Array, ""] | float | None = None) -
 
 
 def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The Cholesky factor; directions in which no code differs from the mean get a little room."""
+    """The Cholesky factor; directions in which the codes do not vary get a small variance."""
     root = jnp.linalg.cholesky(covariance)
     room = 1e-6 * jnp.trace(covariance) * jnp.eye(len(covariance), dtype=covariance.dtype)
     return jnp.where(jnp.all(jnp.isfinite(root)), root, jnp.linalg.cholesky(covariance + room))
@@ -95,11 +95,11 @@ def raw(prior: ShapePrior, bound: Float[Array, ""] | float | None = None) -> Lat
 
 
 def fold(point: Float[Array, "*n"], bound: Float[Array, ""] | float | None) -> Float[Array, "*n"]:
-    """Map every number into [-bound, bound]: the identity, but near the ends, where it turns back.
+    """Map numbers into [-bound, bound]: the identity, except near the ends, where it turns back.
 
-    The last tenth before a bound is a parabola that touches it, and the whole repeats mirrored, as
-    in pycma's `BoxConstraintsLinQuadTransformation`: smooth, so that gradients pass and a normal
-    distribution stays nearly normal.
+    The last tenth before a bound is a parabola that touches the bound, and beyond it the map
+    repeats mirrored, as in pycma's `BoxConstraintsLinQuadTransformation`: smooth, so that gradients
+    pass and a normal distribution stays nearly normal.
     """
     if bound is None:
         return point

@@ -32,8 +32,8 @@ class Tolerances:
         tolfun: Range of the losses of a generation and of the best losses of recent ones.
         tolfunhist: Range of the best losses of recent generations.
         tolx: Standard deviation of every coordinate, in units of the search space.
-        tolxstagnation: Distance that the mean moves over 20 generations and a tenth of all, in
-            units of the search space.
+        tolxstagnation: Distance that the mean moves over 20 generations plus a tenth of all so far,
+            in units of the search space.
         tolstagnation: Whether to end after 100 + 100 d^1.5 / population generations without falling
             medians.
         tolfacupx: Growth of a coordinate's standard deviation over sigma0; an upper limit.
@@ -44,7 +44,7 @@ class Tolerances:
         noeffect: Whether to end where a step no longer changes the mean.
 
     Raises:
-        ValueError: A threshold is negative or no number. Traced values are not checked.
+        ValueError: A threshold is negative or not a number. Traced values are not checked.
     """
 
     tolfun: Number = 1e-11
@@ -74,12 +74,13 @@ class History(NamedTuple):
         tolstagnation: Generations without improvement that end a search; restarts keep the number
             of the first run.
         best_losses: Best losses of recent generations `[short]`; +inf before the first.
-        recorded: Entries of the long history, counted even where they no longer fit.
+        recorded: Number of entries that the long history has received, including those that no
+            longer fit.
         long_best: Best loss of every fifth generation `[long]`.
         long_median: Median loss of every fifth generation `[long]`.
         flat: Generations in a row whose losses were flat.
         anchor: Mean after its last move `[d]`.
-        anchored: The generation in which it last moved.
+        anchored: The generation in which the mean last moved.
         lowest: Best loss of all generations.
         improved: The evaluation in which that loss was found, counted from 1.
         stagnates: Whether the long history no longer falls.
@@ -164,7 +165,7 @@ def _remember(
     population: int | Int[Array, ""],
     tolerances: Tolerances,
 ) -> History:
-    """The history with this generation in it."""
+    """The history with this generation added."""
     old, now = state.history, state.generation
     best, window = ranked[0], _window(old.tolstagnation)
     median = (ranked[(population - 1) // 2] + ranked[population // 2]) / 2

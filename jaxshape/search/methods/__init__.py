@@ -1,8 +1,8 @@
 """Searches by name; `names.py` says which names there are.
 
 A module of this folder is a family of searches: its name is the method's name everywhere, the
-command line included, and its `build(variant, dim, config)` gives the search. Functions of other
-packages go by their import path or by an entry point.
+command line included, and its `build(variant, dim, config)` gives the search. A function of another
+package is named by its import path or by an entry point.
 """
 
 from jaxshape.search.config import RefineConfig
@@ -17,7 +17,7 @@ def build_refiner(name: str, dim: int, config: RefineConfig) -> Refiner:
         name: `family` or `family:variant`, as in "cma", "cma:ipop" and "gradient:adam", or
             `package.module:function`, the import path of a function that takes
             `(variant, dim, config)`.
-        dim: Numbers in a point of the search space, 1 or more.
+        dim: Dimension of the search space, 1 or more.
         config: Settings of the search.
 
     Returns:

@@ -39,14 +39,15 @@ def cma(
     population: int | None = None,
     tolerances: Tolerances = Tolerances(),
 ) -> Refiner:
-    """CMA-ES over points of `dim` numbers, starting from N(point, sigma0^2 I).
+    """CMA-ES over points of dimension `dim`, starting from N(point, sigma0^2 I).
 
     To start from another covariance, search in another space (`space.py`). `resume` keeps mean,
-    sigma and C of an earlier search, but not its paths, which led down another objective. For your
-    own loop, or an objective outside of JAX, use `cma_start`, `cma_ask` and `cma_tell`.
+    sigma and C of an earlier search, but not its evolution paths, which belong to another
+    objective. For your own loop, or an objective outside of JAX, use `cma_start`, `cma_ask` and
+    `cma_tell`.
 
     Args:
-        dim: Numbers in a point, 1 or more.
+        dim: Dimension of a point, 1 or more.
         sigma0: First standard deviation, above 0, in units of the search space.
         population: Candidates per iteration, 3 or more; None for pycma's 4 + floor(3 ln dim).
         tolerances: Stop criteria that end the search.

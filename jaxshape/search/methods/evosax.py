@@ -48,17 +48,17 @@ MULTIPLES = (
     dict.fromkeys(FOLLOW_A_GRADIENT | {"CR_FM_NES", "SV_CMA_ES"}, 2)  # mirrored candidates
     | {"SV_Open_ES": 4}
 )
-"""Numbers of which the population of a strategy must be a multiple."""
+"""For each strategy, the number of which its population must be a multiple."""
 
 
 class EvosaxState(NamedTuple):
-    """The strategy's own state, and where it lies in the search space.
+    """The strategy's own state, and its origin in the search space.
 
     Attributes:
         mean: Centre of the distribution `[d]`.
         best: The best candidate so far.
         stop: Always RUNNING, since evosax has no stop criteria.
-        origin: The first point `[d]`, zero of the strategy's coordinates.
+        origin: The first point `[d]`, the origin of the strategy's coordinates.
         evaluations: Evaluations of the objective so far, the start included.
         strategy_state: State of the evosax strategy.
     """
@@ -74,8 +74,8 @@ class EvosaxState(NamedTuple):
 def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
     """The strategy that the variant names, `NAME` or `NAME@POPULATION`.
 
-    A name without a population uses the one of the settings, or the next larger that the strategy
-    accepts: some need an even one.
+    If the name has no population, the population is that of the settings, rounded up to a number
+    that the strategy accepts: some need an even one.
     """
     name, at, number = (variant or "").partition("@")
     if not at:
@@ -97,13 +97,13 @@ def evosax_strategy(
 ) -> Refiner:
     """An evosax strategy by name: "Sep_CMA_ES", "SNES", "Open_ES" and their like.
 
-    The strategy searches u in point = first + sigma0 u from u = 0, so that `sigma0` is the initial
-    standard deviation of strategies that start at their default of 1, and the unit of every length
-    and learning rate. Losses that are not finite count as the worst finite one.
+    The strategy searches for u, from u = 0, and the point is first + sigma0 u. So `sigma0` is the
+    unit of every length and learning rate, and the initial standard deviation of strategies that
+    start at their default of 1. Losses that are not finite count as the worst finite one.
 
     Args:
         name: Name of one of evosax's distribution-based strategies.
-        dim: Numbers in a point, 1 or more.
+        dim: Dimension of a point, 1 or more.
         population: Candidates per iteration, 1 or more. Strategies that mirror their candidates
             need an even number; `SV_CMA_ES` and `SV_Open_ES` divide it between two populations.
         sigma0: Standard deviation of the first candidates, above 0, in units of the search space.

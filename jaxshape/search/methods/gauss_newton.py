@@ -1,11 +1,11 @@
 """Levenberg-Marquardt on the Gauss-Newton matrix of the objective: `gauss-newton`.
 
-The objective of a shape is nearly quadratic in the code: where its quadratic model about the best
-point is least, it is nearly as low as the model says. Each step goes to the minimum of the model,
-damped where the model has proved wrong, in the directions in which the objective curves most
-(`curvature.py`). `gauss-newton:20` takes 20 of them; the dimension of the code gives the full
-matrix. On a CPU a product with the matrix takes as long as a gradient, and the Jacobian of a
-100-number code as long as 47 gradients.
+The objective of a shape is nearly quadratic in the code: at the minimum of its quadratic model
+about the best point, it is nearly as low as the model predicts. Each step goes to the minimum of
+the model, in the directions in which the objective curves most (`curvature.py`), and is damped
+where the model has proved wrong. `gauss-newton:20` takes 20 directions; as many as the dimension of
+the code give the full matrix. On a CPU a product with the matrix takes as long as a gradient, and
+the Jacobian of a 100-dimensional code as long as 47 gradients.
 """
 
 from typing import NamedTuple
@@ -32,10 +32,10 @@ DIRECTIONS = 10
 """Directions of each expansion: with fewer the steps are shorter, with more they cost more."""
 
 DAMPING = 2e-3
-"""First damping, as a part of the largest curvature."""
+"""First damping, as a fraction of the largest curvature."""
 
 EASIER, HARDER = 1 / 4, 4.0
-"""Factors of the damping where the model proved right, and where it proved wrong."""
+"""Factors of the damping after a good and after a bad prediction of the model."""
 
 
 class GaussNewtonState(NamedTuple):
@@ -47,8 +47,8 @@ class GaussNewtonState(NamedTuple):
         stop: Why the search ended, as a `StopReason`; RUNNING while it goes on.
         model: The objective about the best point: its gradient, and its curvature in the directions
             that were asked for.
-        known: Whether the model was found; before the first iteration it is all zeros.
-        damping: Damping of the next step, as a part of the largest curvature.
+        known: Whether the model was computed; before the first iteration it is all zeros.
+        damping: Damping of the next step, as a fraction of the largest curvature.
         evaluations: Evaluations of the objective so far, the start included; a gradient is one, and
             so is a product with the matrix.
     """
@@ -82,17 +82,18 @@ def gauss_newton(
 ) -> Refiner:
     """Levenberg-Marquardt steps to the minimum of the quadratic model about the best point.
 
-    Each iteration evaluates one point. Where that is better than the best one the model is found
-    anew, at the cost of one gradient and `directions` products; where not, the damping grows. The
-    first iteration only finds the model. The state keeps the model of the best point, so that the
-    curvature of the objective can be had from it. The objectives of `refine` and `js.objective`
-    have a Gauss-Newton matrix; for a plain function of JAX the matrix is the Hessian, whose
-    negative curvature counts as 0.
+    Each iteration evaluates one point. If the point is better than the best one, the model is
+    computed again, at the cost of one gradient and `directions` products; if not, the damping
+    grows. The first iteration only computes the model. The state keeps the model of the best point,
+    so that the curvature of the objective can be read from it. The objectives of `refine` and
+    `js.objective` have a Gauss-Newton matrix; for a plain function of JAX the matrix is the
+    Hessian, whose negative curvature counts as 0.
 
     Args:
-        dim: Numbers in a point, 1 or more.
-        directions: Directions in which the curvature is found, 1 or more; `dim` at most are used.
-        damping: First damping, above 0, as a part of the largest curvature.
+        dim: Dimension of a point, 1 or more.
+        directions: Directions in which the curvature is computed, 1 or more; at most `dim` are
+            used.
+        damping: First damping, above 0, as a fraction of the largest curvature.
         tolerance: The search ends when the model promises to lower the loss by less than this, 0 or
             more, in the units of the loss; 0 never ends it.
 
@@ -135,7 +136,7 @@ def gauss_newton(
         improved = best.loss < state.best.loss
         wanted = improved | ~state.known
         found = expand(only_where(wanted, objective), best.point, count)
-        kept = (state.best.loss - loss) / promised  # what is NaN makes it harder
+        kept = (state.best.loss - loss) / promised  # NaN increases the damping
         factor = jnp.where(kept > 0.75, EASIER, jnp.where(kept > 0.25, 1, HARDER))
         is_still = promised < jnp.maximum(tolerance, jnp.finfo(loss.dtype).eps * jnp.abs(best.loss))
         stopped = state.known & is_still & (tolerance > 0)
@@ -167,11 +168,11 @@ def damped_step(
 
     Args:
         model: The objective about a point. Negative curvature counts as 0.
-        damping: The multiple, above 0, as a part of the largest curvature.
+        damping: The multiple, above 0, as a fraction of the largest curvature.
 
     Returns:
-        The step from the point to the minimum `[d]`, and by how much the model without the damping
-        says that it lowers the loss.
+        The step from the point to the minimum `[d]`, and the decrease of the loss that the undamped
+        model predicts for it.
     """
     values, axes = jnp.linalg.eigh(model.matrix)
     values = jnp.maximum(values, 0)
@@ -183,6 +184,6 @@ def damped_step(
 
 
 def _nothing(point: Float[Array, " d"], count: int) -> Expansion:
-    """A model of which nothing is known."""
+    """A model of zeros, for a search that has computed none yet."""
     zeros = lambda *shape: jnp.zeros(shape, point.dtype)  # noqa: E731
     return Expansion(zeros(), zeros(len(point)), zeros(count, len(point)), zeros(count, count))

@@ -1,6 +1,6 @@
 """Descent along the gradient: `gradient`, and any optax optimiser, `gradient:adam`, ...
 
-Optimisers of `optax.contrib` go by their own names too, `gradient:prodigy`.
+Optimisers of `optax.contrib` are found by name, too, as in `gradient:prodigy`.
 """
 
 import functools
@@ -46,8 +46,8 @@ LIKE_PLAIN_DESCENT = {
 descent."""
 
 LEARNING_RATE = 0.1
-"""Learning rate of optimisers without an entry, in either space; most of them turn the gradient
-into steps of about this length in each coordinate."""
+"""Learning rate of optimisers without an entry below, in either space; most of them turn the
+gradient into steps of about this length in each coordinate."""
 
 LEARNING_RATES = (
     dict.fromkeys(["adafactor", "fromage", "lamb", "lion", "rmsprop"], 0.02)
@@ -56,7 +56,7 @@ LEARNING_RATES = (
     | dict.fromkeys(["madgrad", "radam", "sm3", "yogi"], 1.0)
     | {"acprop": 0.005, "adadelta": 20.0, "lars": 20.0}
 )
-"""Learning rates where another one does better: the best of 0.02, 0.1, 1 and 20 on procedural
+"""Learning rates of optimisers that need another one: the best of 0.02, 0.1, 1 and 20 on procedural
 chairs. With the defaults of optax, `adadelta` climbs and `adafactor` diverges."""
 
 UNUSABLE = {
@@ -67,7 +67,7 @@ UNUSABLE = {
     "schedule_free": "it changes another optimiser",
     "sophia": "it estimates the Hessian, and the objective of a shape has first derivatives only",
 }
-"""Optimisers that no name stands for, and why."""
+"""Optimisers that cannot be chosen by name, and the reason."""
 
 
 class GradientState(NamedTuple):
@@ -79,7 +79,7 @@ class GradientState(NamedTuple):
         stop: Why the search ended, as a `StopReason`; RUNNING while it goes on.
         optimizer_state: State of the optax optimiser.
         evaluations: Evaluations of the objective so far, the start included.
-        last_loss: Loss of the iteration before.
+        last_loss: Loss of the previous iteration.
         still: Iterations in a row that changed the loss by less than the tolerance.
     """
 
@@ -102,7 +102,7 @@ def build(variant: str | None, dim: int, config: RefineConfig) -> Refiner:
 
 
 def optimizers() -> dict[str, Callable[..., optax.GradientTransformation]]:
-    """The optimisers of optax and optax.contrib that need a learning rate at most, by name."""
+    """The optimisers of optax and optax.contrib that need at most a learning rate, by name."""
     both = vars(optax.contrib) | vars(optax)
     names = sorted(name for name, x in both.items() if _is_optimizer(name, x))
     return {name: both[name] for name in names if name not in UNUSABLE}
@@ -114,7 +114,7 @@ def _is_optimizer(name: str, x: Any) -> bool:
 
 
 def _rate_name(factory: Callable[..., Any]) -> str:
-    """The name of its argument for the learning rate; empty where it has none."""
+    """Name of the factory's argument for the learning rate; empty if it has none."""
     names = inspect.signature(factory).parameters
     return next((name for name in ("learning_rate", "max_learning_rate") if name in names), "")
 
@@ -140,7 +140,7 @@ def _optimizer(name: str, config: RefineConfig) -> optax.GradientTransformation:
     if rate is None and argument.default is argument.empty:
         rate = LEARNING_RATE
     settings: dict[str, Any] = {} if rate is None else {argument.name: rate}
-    if "key" in arguments:  # of optimisers that add noise
+    if "key" in arguments:  # optimisers that add noise
         settings["key"] = 0
     return factory(**settings)
 
@@ -153,11 +153,11 @@ def gradient(
 ) -> Refiner:
     """Descend the gradient of the objective.
 
-    Optimisers with a line search (`optax.lbfgs`) work too; theirs evaluates the objective more
-    than once per step. Each step evaluates the current point and then moves it, so the end point of
-    the last step is in `mean`, but not in `best`. A loss or gradient that is not finite sends the
-    search back to the best point, with the optimiser started afresh; where the same step fails
-    every time, the search stays there.
+    Optimisers with a line search (`optax.lbfgs`) work too; the line search evaluates the objective
+    more than once per step. Each step evaluates the current point and then moves it, so the end
+    point of the last step is in `mean`, but not in `best`. A loss or gradient that is not finite
+    sends the search back to the best point, with the optimiser started afresh; where the same step
+    fails every time, the search stays there.
 
     Args:
         optimizer: An optax optimiser, or a number above 0: the step size of plain descent (paper:

@@ -19,7 +19,7 @@ from jaxshape.search.methods import build_refiner
 from jaxshape.search.refiner import Candidate, Objective, Refiner, StopReason, Trace
 
 POLISH = 0.2
-"""Share of the iterations that are left to the gradient."""
+"""Share of the iterations that the gradient search gets."""
 
 
 class HybridState(NamedTuple):
@@ -79,8 +79,8 @@ def polished(search: Refiner, polish: Refiner, iterations: int) -> Refiner:
         return state, trace
 
     def step(key: Array, state: HybridState, objective: Objective) -> tuple[HybridState, Trace]:
-        # A batch has objects in both searches, so both take their step; but the one that rests
-        # asks for points that are not finite, which are not decoded.
+        # A batch has objects in both searches, so both make a step; but the inactive search gets
+        # points that are not finite, which are not decoded.
         search_key, polish_key, begin_key = jax.random.split(key, 3)
         polishing = state.polishing
         stepped = search.step(search_key, state.searched[0], only_where(~polishing, objective))
