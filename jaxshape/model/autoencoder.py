@@ -31,7 +31,8 @@ NORM_EPSILON = 1e-5
 """Added to variances by batch normalisation, Flax's default."""
 
 LEAKY_SLOPE = 0.2
-"""Slope of the leaky ReLU. The paper gives none; DCGAN, whose initialisation it uses, has this."""
+"""Slope of the leaky ReLU. The paper gives none; this is that of DCGAN, whose initialisation it
+uses."""
 
 
 class AutoEncoder(nn.Module):
@@ -39,7 +40,8 @@ class AutoEncoder(nn.Module):
 
     Attributes:
         architecture: Sizes of the network.
-        dtype: Type of the arithmetic of convolutions; parameters and batch statistics stay float32.
+        dtype: Data type in which convolutions compute; parameters and batch statistics stay
+            float32.
         axis: Mesh axis over which a batch is spread, so that statistics cover the whole batch; None
             where it is not spread.
     """
@@ -72,7 +74,7 @@ class AutoEncoder(nn.Module):
 class Encoder(nn.Module):
     """32 -> 16 -> 8 -> 4 -> 2 by strided convolutions, then pooling and a 1^3 convolution.
 
-    Each further layer takes a grid of twice the resolution. Takes the fields of `AutoEncoder`.
+    Each further layer takes a grid of twice the resolution. The fields are those of `AutoEncoder`.
     """
 
     architecture: Architecture
@@ -92,7 +94,7 @@ class Encoder(nn.Module):
 class Decoder(nn.Module):
     """1 -> 4 -> 8 -> 16 -> 32 by transposed convolutions; each further layer doubles again.
 
-    Takes the fields of `AutoEncoder`.
+    The fields are those of `AutoEncoder`.
     """
 
     architecture: Architecture
@@ -143,7 +145,7 @@ def initialize(key: PRNGKeyArray, architecture: Architecture = Architecture()) -
         architecture: Sizes of the network.
     """
     seen = jnp.zeros((1, *[architecture.resolution] * 3, 1 + architecture.occlusion), jnp.float32)
-    # Under jit the forward pass, which Flax traces to find the shapes, is left out.
+    # Flax traces the forward pass to find the shapes; under jit it is not executed.
     return jax.jit(partial(AutoEncoder(architecture).init, train=False))(key, seen)
 
 
@@ -159,7 +161,7 @@ def seen_by_encoder(grids: Grids, occlusion: bool) -> Float[Array, "b x y z c"]:
 
 
 def architecture_of(params: PyTree) -> Architecture:
-    """Read the sizes off the parameters.
+    """Read the sizes of the network from its parameters.
 
     Args:
         params: Parameters of an auto-encoder, as arrays or as their shapes.
@@ -175,13 +177,13 @@ def architecture_of(params: PyTree) -> Architecture:
 
 
 def shapes(params: PyTree) -> PyTree:
-    """The arrays, as shapes, of a network of the sizes that the parameters seem to have."""
+    """Expected shapes of all arrays, for a network of the sizes that the parameters suggest."""
     architecture = architecture_of(params)
     return jax.eval_shape(lambda: initialize(jax.random.key(0), architecture))
 
 
 def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
-    """The code of F, or of F and M, as the sizes of the encoder say."""
+    """The code of F, or of F and M, depending on the channels of the encoder."""
     architecture = architecture_of(params)
     seen = seen_by_encoder(grids, architecture.occlusion)
     return jnp.asarray(AutoEncoder(architecture).apply(params, seen, method="encode"))
@@ -225,7 +227,7 @@ def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepar
 
 
 def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y z"]:
-    """Logits of the occupancy that codes stand for."""
+    """Logits of the occupancy grids of codes."""
     decoder: PreparedDecoder = prepared.shared
     code = code.astype(decoder.first.dtype)
     x = jnp.einsum("bd,xyzcd->bxyzc", code, decoder.first, preferred_element_type=jnp.float32)

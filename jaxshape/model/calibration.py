@@ -1,7 +1,7 @@
 """Calibration of decoded logits as probabilities.
 
-Networks are too sure of voxels that nobody saw. Three numbers, fitted to objects that the network
-was not trained on and stored with its weights, correct that: see `Calibration`.
+Networks are overconfident in voxels that were not measured. Three numbers correct this; they are
+fitted to objects outside the training set and stored with the weights: see `Calibration`.
 """
 
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from jaxtyping import Array, Float
 
 
 class Calibration(NamedTuple):
-    """A map from logits to probabilities that come true as often as they say.
+    """A map from logits to calibrated probabilities.
 
-    It is Platt scaling with a slope that falls with the spread of the samples of the posterior:
-    where shapes that explain the measurement equally well differ, a logit is believed less.
+    It is Platt scaling with a slope that decreases with the spread of the posterior samples: where
+    shapes that explain the measurement equally well differ, a logit counts less.
 
     Attributes:
         slope: Factor of a logit on which all samples agree, above 0.
-        doubt: By how much the slope falls for a standard deviation of the samples' logits of 1, 0
-            or more.
+        doubt: Decrease of the slope per unit of standard deviation of the samples' logits, 0 or
+            more.
         offset: Logit to add.
     """
 
@@ -41,4 +41,4 @@ class Calibration(NamedTuple):
 
 
 UNCALIBRATED = Calibration()
-"""Takes logits at their word, for weights that were not calibrated."""
+"""The sigmoid of the logits without correction, for weights that were not calibrated."""

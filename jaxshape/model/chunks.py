@@ -27,7 +27,7 @@ def in_chunks(function: Callable[..., PyTree], size: int, *examples: Array) -> P
 def sum_chunks(function: Callable[..., Array], size: int, *examples: Array) -> Array:
     """Sum a batched function over at most `size` examples at a time, in float32.
 
-    The function must be additive over examples and zero where they are zero.
+    The function must be additive over examples, and 0 for examples of zeros.
     """
     chunks = -(-examples[0].shape[0] // size)
     each = -(-examples[0].shape[0] // max(chunks, 1))
@@ -39,13 +39,13 @@ def sum_chunks(function: Callable[..., Array], size: int, *examples: Array) -> A
 
 
 def vary_like(tree: PyTree, example: Array) -> PyTree:
-    """The same arrays, varying over the devices of a `jax.shard_map` wherever an example does.
+    """The same arrays, marked as varying over the `jax.shard_map` axes that an example varies over.
 
-    Loops want their first state to be of the type of the later ones, and under `jax.shard_map` that
-    says along which axes of the mesh an array may differ.
+    The first state of a loop must have the type of the later ones, and under `jax.shard_map` the
+    type includes the mesh axes along which an array may differ.
 
     Args:
-        tree: Tree of arrays, constants among them.
+        tree: Tree of arrays, which may be constants.
         example: An array that belongs to the examples.
     """
     axes = _axes_of(example)
@@ -58,7 +58,7 @@ def vary_like(tree: PyTree, example: Array) -> PyTree:
 
 
 def _axes_of(x: Any) -> frozenset[str]:
-    """Axes along which an array may differ; JAX has had two names for them."""
+    """Axes along which an array may differ; their name depends on the version of JAX."""
     kind: Any = jax.typeof(x)
     return kind.vma if hasattr(kind, "vma") else kind.manual_axis_type.varying
 

@@ -1,13 +1,13 @@
 """A network conditioned on the measurement: measured detail bypasses the code.
 
 `COMPLETION` is its `ShapeModel`, a conditional variational auto-encoder with the skip connections
-of a U-Net. The measurement (soft F and M) goes down from 16^3 to 4^3 voxels of features, once for
-each object. A code joins them at 4^3 and on the way up again, where skip connections add the
-features of each size. Given the measurement, codes of all objects are normally distributed with
-mean 0 and variance 1, so that the first code is 0 and half the squared length of a code is its cost
-in nats.
+of a U-Net. The encoder reduces the measurement (soft F and M) to features of 16^3 down to 4^3
+voxels, once for each object. The code enters at 4^3 and at each size on the way up, where skip
+connections add the features of that size. Given the measurement, codes of all objects are normally
+distributed with mean 0 and variance 1, so that the first code is 0 and half the squared length of a
+code is its cost in nats.
 
-In training a posterior network sees the complete shape too and says which codes lead to it.
+In training a posterior network also takes the complete shape and predicts which codes lead to it.
 """
 
 from functools import partial
@@ -26,7 +26,7 @@ from jaxshape.model.shapes import Precision, Prepared, ShapeModel
 from jaxshape.model.stencil import convolve, multiply
 
 PATCH = 2
-"""Voxels along each side of the patches that become the first features."""
+"""Side of the voxel patches from which the first features are computed, in voxels."""
 
 CHANNELS = 4
 """Channels of `evidence_of`."""
@@ -147,7 +147,7 @@ def _blocks(x, blocks, code=None):
 
 
 def _gathered(x: Float[Array, "b x y z c"]) -> Float[Array, "b x//2 y//2 z//2 8*c"]:
-    """Each 2^3 voxels become one, with all their channels."""
+    """Merge each block of 2^3 voxels into one voxel that has all their channels."""
     b, n, _, _, c = x.shape
     m = n // PATCH
     x = x.reshape(b, m, PATCH, m, PATCH, m, PATCH, c).transpose(0, 1, 3, 5, 2, 4, 6, 7)
@@ -155,7 +155,7 @@ def _gathered(x: Float[Array, "b x y z c"]) -> Float[Array, "b x//2 y//2 z//2 8*
 
 
 def _spread(x: Float[Array, "b x y z c"]) -> Float[Array, "b 2*x 2*y 2*z c//8"]:
-    """The inverse of `_gathered`: each voxel becomes 2^3."""
+    """The inverse of `_gathered`: split each voxel into a block of 2^3."""
     b, m, _, _, c = x.shape
     x = x.reshape(b, m, m, m, PATCH, PATCH, PATCH, c // PATCH**3)
     x = x.transpose(0, 1, 4, 2, 5, 3, 6, 7)
@@ -166,17 +166,17 @@ def _spread(x: Float[Array, "b x y z c"]) -> Float[Array, "b 2*x 2*y 2*z c//8"]:
 
 
 def evidence_of(grids: Grids) -> Float[Array, "b x y z 4"]:
-    """Probabilities of measured surface and of free space, there and at the mirror image.
+    """Probabilities of measured surface and free space, in each voxel and in its mirror image.
 
-    Many objects are symmetric. Each side then carries the measurement of the other one as well, and
-    the network learns how far to believe it.
+    Many objects are symmetric. With these channels, each side also has the measurement of the other
+    side, and the network learns how much to trust it.
     """
     seen = from_grids(grids)
     return jnp.stack([*seen, *map(mirror, seen)], axis=-1)
 
 
 def skips(params: PyTree, grids: Grids, dtype: Any = jnp.float32) -> Skips:
-    """Features of what was measured."""
+    """Features of the measurement."""
     net = params["measured"]
     fine = _dense(_gathered(evidence_of(grids).astype(dtype)), net["stem"])
     fine = _block(fine, net["fine"])
@@ -241,15 +241,15 @@ def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepar
 def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y z"]:
     """Logits of codes, each with the features of its object.
 
-    They are the mean of two answers, of the object as it is and mirrored: the mirror image of a
-    measurement then gets the mirror image of the answer.
+    They are the mean of two predictions, for the object and for its mirror image, so that a
+    mirrored measurement gives the mirrored prediction.
     """
     here, there = (decode_skips(prepared.shared, side, code) for side in prepared.own)
     return (here + mirror(there)) / 2
 
 
 def architecture_of(params: PyTree) -> Completion:
-    """Read the sizes off the parameters, given as arrays or as their shapes."""
+    """Read the sizes of the network from its parameters, given as arrays or as their shapes."""
     down, decoder = params["measured"], params["decoder"]
     code, cells = decoder["code"]["kernel"].shape
     coarse = down["down2"]["kernel"].shape[-1]
@@ -262,7 +262,7 @@ def architecture_of(params: PyTree) -> Completion:
 
 
 def shapes(params: PyTree) -> PyTree:
-    """The arrays, as shapes, of a network of the sizes that the parameters seem to have."""
+    """Expected shapes of all arrays, for a network of the sizes that the parameters suggest."""
     architecture = architecture_of(params)
     return jax.eval_shape(partial(initialize, architecture=architecture), jax.random.key(0))
 

@@ -1,6 +1,6 @@
 """Sizes of networks and settings of their training.
 
-Nothing here imports JAX, so that the command line answers at once.
+Nothing here imports JAX, so that the command line starts quickly.
 """
 
 from dataclasses import dataclass, replace
@@ -17,16 +17,16 @@ Precision = Literal["float32", "bfloat16"]
 
 @dataclass(frozen=True)
 class Architecture:
-    """Sizes of the auto-encoder; the paper gives them in a figure that is lost.
+    """Sizes of the auto-encoder; the figure of the paper that gives them is not available.
 
     The number of layers decides the resolution of its grids: 4 strided convolutions for 32^3, one
     more for 64^3, one less for 16^3.
 
     Attributes:
         encoder: Channels after each strided convolution, each 1 or more.
-        decoder: Channels after each transposed convolution but the last, which has one channel: one
-            entry fewer than `encoder`, each 1 or more.
-        code: Numbers in a code, 2 or more (paper: 100).
+        decoder: Channels after each transposed convolution except the last, which has one channel:
+            one entry fewer than `encoder`, each 1 or more.
+        code: Dimension of a code, 2 or more (paper: 100).
         occlusion: Give the encoder the occlusion mask M beside F, both soft. The paper's encoder
             sees F alone, binary, and cannot tell free voxels from unknown ones.
 
@@ -64,7 +64,7 @@ class Completion:
     Attributes:
         channels: Channels at a half, a quarter and an eighth of the resolution, each 1 or more.
         depth: Blocks at a quarter and an eighth of the resolution on the way down, 1 or more.
-        code: Numbers in a code, 2 or more.
+        code: Dimension of a code, 2 or more.
         resolution: Voxels along each axis of the grids, a multiple of 8.
 
     Raises:
@@ -98,36 +98,37 @@ class TrainConfig:
     The defaults are the preset `default`.
 
     Attributes:
-        architecture: Sizes of the network, and with them its kind: the conditional network, or the
-            paper's auto-encoder.
-        inputs: Settings by which pairs are drawn from the dataset.
-        steps: Batches in all, 1 or more.
+        architecture: Sizes of the network. Their class decides its kind: the conditional network,
+            or the paper's auto-encoder.
+        inputs: Settings for drawing training pairs from the dataset.
+        steps: Total number of batches, 1 or more.
         batch: Pairs in a batch, over all devices, 1 or more.
         optimizer: Adam (paper), or Muon, which orthogonalises the steps of the kernels and needs a
             third of the samples.
-        learning_rate: Peak of the optimiser's step size, above 0 (paper: 1e-4, of Adam).
+        learning_rate: Peak of the optimiser's step size, above 0 (paper: 1e-4, for Adam).
         schedule: Whether the step size warms up and decays to zero along a cosine, or stays
             constant (paper).
-        average: Decay of the running average of the parameters, 0 to below 1, which the finished
-            weights are; 0 for the parameters of the last step.
+        average: Decay of the running average of the parameters that becomes the finished weights, 0
+            to below 1; 0 for the parameters of the last step.
         occupied_weight: Weight of occupied voxels in the loss, above 0 (paper: 1). At 1.5 a voxel
-            counts as occupied from a probability of 0.4 on, where the IoU of shapes as uncertain as
-            these is better than at 0.5.
+            counts as occupied from a probability of 0.4 on; for uncertain shapes this threshold
+            gives a better IoU than 0.5.
         occluded_weight: Weight of occluded voxels in the loss, above 0 (paper: 1).
         code_noise: Standard deviation of noise added to the codes of an auto-encoder, 0 or more.
-        code_weight: Weight of the code penalty, 0 or more. The penalty is the KL divergence of a
-            conditional network's codes, and half the squared length, in nats, of an auto-encoder's;
-            with noise of 1 the latter is the divergence of a posterior of variance 1.
+        code_weight: Weight of the code penalty, 0 or more. For a conditional network the penalty is
+            the KL divergence of the codes. For an auto-encoder it is half the squared length of the
+            codes, in nats; with noise of 1 this is the divergence of a posterior of variance 1.
         posterior_share: Share of each batch for which the conditional network decodes a code of the
-            posterior, from 0 to 1; the others decode its first code. At 0 codes mean nothing.
-        bfloat16: Compute convolutions in bfloat16: the conditional network is then trained 3 to 4
-            times as fast where the processor has matrix units for it. Parameters, statistics and
-            the optimiser stay in float32.
+            posterior, from 0 to 1; the others decode its first code. At 0 codes carry no
+            information.
+        bfloat16: Compute convolutions in bfloat16: the conditional network then trains 3 to 4 times
+            as fast if the processor has matrix units for it. Parameters, statistics and the
+            optimiser stay in float32.
         validation: Number of the dataset's last objects that are kept out of training and completed
-            for each report, 0 or more; at most a tenth of them.
+            for each report, 0 or more; at most a tenth of the dataset.
         report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
             on from the last checkpoint.
-        seed: Seed of the first weights and of the batches, 0 or more.
+        seed: Seed of the initial weights and of the batches, 0 or more.
 
     Raises:
         ValueError: A setting is outside its range.
@@ -172,8 +173,8 @@ _AUTOENCODER = TrainConfig(Architecture(), average=0.0, occluded_weight=1.0, cod
 PRESETS = {
     "default": TrainConfig(),
     "autoencoder": _AUTOENCODER,
-    # Single clean views (the dataset of that name), the plain loss, a constant step. The length is
-    # not given; this is twenty passes over the paper's 69,444 pairs, 18 views of 3,858 chairs.
+    # Single clean views (the dataset of that name), the plain loss, a constant step. The paper does
+    # not give the length; this is twenty passes over its 69,444 pairs, 18 views of 3,858 chairs.
     "paper": replace(
         _AUTOENCODER,
         architecture=Architecture(decoder=(256, 128, 64)),
@@ -186,5 +187,5 @@ PRESETS = {
         validation=0,
     ),
 }
-"""Training runs by name: our best, the best with the paper's network, and the paper's own (section
-2.3)."""
+"""Settings of training runs by name: our best, the best with the paper's network, and those of the
+paper (section 2.3)."""

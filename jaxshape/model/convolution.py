@@ -39,7 +39,7 @@ from jaxshape.process import processor
 
 KERNEL_SIZE = 5
 CACHE_BYTES = 2 * 2**20
-"""Temporaries on CPU are kept below this: of 0.5 to 8 MiB the best for a training step."""
+"""Limit of the temporaries on CPU: the fastest for a training step among 0.5 to 8 MiB."""
 
 # Fine voxel 2 i + phase takes, from the coarse voxel i + shift, this tap of the kernel:
 TAPS = {-1: {0: 4}, 0: {0: 2, 1: 3}, 1: {0: 0, 1: 1}}
@@ -63,7 +63,7 @@ def upsample(
 
 
 class PreparedKernel(NamedTuple):
-    """A kernel for many calls of `upsample_prepared`, with the work done that all calls share.
+    """A kernel for many calls of `upsample_prepared`, which share the work done here.
 
     Attributes:
         kernel: The kernel itself.
@@ -77,8 +77,8 @@ class PreparedKernel(NamedTuple):
 def prepare_kernel(kernel: Float[Array, "5 5 5 fine coarse"], side: int) -> PreparedKernel:
     """Make a kernel ready for coarse grids of `side` voxels along each axis.
 
-    Tiles compute in float32. Where bfloat16 is multiplied by hardware made for it, products of
-    gathered neighbours are faster in that precision; elsewhere they take twice as long.
+    Tiles compute in float32. On hardware with bfloat16 matrix units, products of gathered
+    neighbours in bfloat16 are faster; elsewhere they take twice as long.
     """
     pays = kernel.dtype == jnp.float32 or not multiplies_bfloat16()
     tiled = pays and kernel.shape[-2] > 1 and side >= TILE
@@ -107,7 +107,7 @@ def upsample_prepared(
 
 
 def _kernel_gradient(fine, coarse, kernel_like):
-    """Gradient, by the kernel, of the inner product of `downsample(fine, kernel)` with `coarse`."""
+    """Gradient, in the kernel, of the inner product of `downsample(fine, kernel)` with `coarse`."""
     gradient = lax.platform_dependent(
         fine, coarse, cpu=_kernel_gradient_cpu, default=_kernel_gradient_xla
     )
@@ -182,7 +182,7 @@ def _kernel_gradient_cpu(fine, coarse):
 
 
 def _tiled(coarse_shape, kernel_shape) -> bool:
-    """Whether there are tiles enough to be worth the transform of the kernel."""
+    """Whether there are enough tiles for the transform of the kernel to pay off."""
     return kernel_shape[-2] > 1 and min(coarse_shape[1:3]) >= 2 * TILE
 
 
@@ -192,7 +192,7 @@ def _in_cache(values: int) -> int:
 
 
 def matmul(a, b):
-    """Products of bfloat16 gather in float32, which is also faster on CPU than in bfloat16."""
+    """Products of bfloat16 accumulate in float32, which is also faster on CPU than in bfloat16."""
     return jnp.matmul(a, b, preferred_element_type=jnp.float32)
 
 
@@ -222,7 +222,7 @@ def _gather_taps(
 
 
 def _gather_then_multiply(kernel) -> Callable[[Array], Array]:
-    """Gather shifts along z; per shift along x and y one product, for just the phases it feeds."""
+    """Gather shifts along z; multiply once per shift along x and y, for the phases it feeds."""
     fine, coarse = kernel.shape[-2:]
     shifts = list(itertools.product(TAPS, repeat=2))
     matrices = [
@@ -245,7 +245,7 @@ def _gather_then_multiply(kernel) -> Callable[[Array], Array]:
 
 
 def _z_matrix(kernel: Float[Array, "5 fine coarse"]) -> Float[Array, "3*coarse 2*fine"]:
-    """From the three gathered shifts along z to the two phases along z."""
+    """The matrix from the three gathered shifts along z to the two phases along z."""
     zero = jnp.zeros_like(kernel[0])
     blocks = [[kernel[TAPS[d][p]] if p in TAPS[d] else zero for p in PHASES] for d in TAPS]
     return jnp.concatenate([jnp.concatenate(row, axis=0).T for row in blocks], axis=0)
@@ -254,7 +254,7 @@ def _z_matrix(kernel: Float[Array, "5 fine coarse"]) -> Float[Array, "3*coarse 2
 def _multiply_then_shift(
     coarse: Float[Array, "b x y z coarse"], kernel: Float[Array, "5 5 5 1 coarse"]
 ) -> Float[Array, "b 2*x 2*y 2*z 1"]:
-    """One product with all 125 taps, then the shifts, one axis at a time; they move few values.
+    """Multiply once with all 125 taps, then shift one axis at a time, which moves few values.
 
     Voxels come last in the product, so that shifting them is cheap.
     """
@@ -292,7 +292,7 @@ def _taps(shift: tuple[int, ...]) -> dict[tuple[int, ...], tuple[int, ...]]:
 def _interleave(
     phases: Float[Array, "b x y z _ _"], fine: int
 ) -> Float[Array, "b 2*x 2*y 2*z {fine}"]:
-    """Eight phases per coarse voxel, in the order of their axes, to the fine grid."""
+    """Arrange the eight phases of each coarse voxel, ordered by axis, in the fine grid."""
     b, nx, ny, nz = phases.shape[:4]
     phases = phases.reshape(b, nx, ny, nz, 2, 2, 2, fine)
     return phases.transpose(0, 1, 4, 2, 5, 3, 6, 7).reshape(b, 2 * nx, 2 * ny, 2 * nz, fine)

@@ -1,9 +1,9 @@
 """The orientation of meshes, from a prior's predictions and from how stably they stand. [host]
 
-A prior knows its objects upright and from their front. Half of a surface is hidden from it, four
-times: back, front, top and bottom. It predicts the hidden part best where the mesh is oriented like
-the training meshes. How seats stand (`jaxshape.data.orientation`) has a say in which way is up.
-Of 13 real seats turned at random to one of 24 orientations, 12 were turned back so.
+A prior was trained on upright objects with a known front. Four times, half of a surface is hidden
+from it: back, front, top and bottom. It predicts the hidden half best if the mesh is oriented like
+the training meshes. The stability of seats (`jaxshape.data.orientation`) contributes to the choice
+of the up axis. Of 13 real seats turned at random to one of 24 orientations, this turned 12 back.
 """
 
 from collections import Counter
@@ -29,12 +29,12 @@ STANCE = 0.1
 """Weight of a seat's stance, relative to nats per voxel of the prior's prediction."""
 
 CLEAR = 0.02
-"""By how much axes must score better than others: of 25 real seats that look along +z, one scored
-better by more another way, a pouf."""
+"""Least lead of the best axes over others. Of 25 real seats that face +z, only one, a pouf, scored
+better by more in another orientation."""
 
 KNOWN = -0.33
-"""Mean score that a collection reaches in its best axes where a prior knows its kind: 13 seats have
--0.19 with the weights for chairs, and mugs less than -0.38."""
+"""Mean score, in the best axes, from which a prior counts as knowing the kind of a collection: with
+the weights for chairs, 13 seats have -0.19, and mugs less than -0.38."""
 
 Scores = Mapping[UpFront, float]
 
@@ -42,13 +42,12 @@ Scores = Mapping[UpFront, float]
 def facing_scores(
     prior: ShapePrior, mesh: trimesh.Trimesh, ups: Iterable[str] | None = None
 ) -> dict[UpFront, float]:
-    """Score pairs of axes of a mesh as the ones that point up and to the front.
+    """Score each pair of axes of a mesh as its up and front axes.
 
     Args:
         prior: The shape prior.
         mesh: The mesh, its box centred at the origin.
-        ups: Axes to try as up; None for all orientations that the stance of a seat does not rule
-            out.
+        ups: Axes to try as the up axis; None for all that the stance of a seat does not rule out.
 
     Returns:
         For each pair of axes `(up, front)` nats per hidden voxel, with the stance added.
@@ -71,7 +70,7 @@ def facing_scores(
 
 
 def _turned(surface: Bool[np.ndarray, "x y z"], axes: UpFront) -> Bool[np.ndarray, "x y z"]:
-    """The grid as it is where the axes point up and to the front."""
+    """Rotate a grid so that the given axes point up and to the front."""
     rotation = axes_to_canonical(*axes)
     turned = np.transpose(surface, np.abs(rotation).argmax(axis=1))
     return np.flip(turned, tuple(np.flatnonzero(rotation.sum(axis=1) < 0).tolist()))
@@ -100,11 +99,11 @@ def _halves(n: int) -> Float[np.ndarray, "4 n n n"]:
 
 
 def usual_axes(scores: Mapping[str, Scores], given: UpFront) -> UpFront:
-    """The axes of most of the meshes that say clearly which are theirs.
+    """The most frequent axes among the meshes whose best axes lead clearly.
 
     Args:
         scores: Scores of each mesh, by its name.
-        given: Axes that count where no mesh is clear.
+        given: Axes to return if no mesh has a clear lead.
     """
     clear = []
     for own in scores.values():
@@ -115,11 +114,11 @@ def usual_axes(scores: Mapping[str, Scores], given: UpFront) -> UpFront:
 
 
 def dissenting(scores: Mapping[str, Scores], usual: UpFront) -> dict[str, UpFront]:
-    """The meshes that clearly have other axes than most of their collection, and which.
+    """The meshes whose axes clearly differ from those of their collection, with these axes.
 
     Args:
         scores: Scores of each mesh, by its name.
-        usual: The axes of most.
+        usual: The axes of most meshes of the collection.
     """
     best = {name: max(own, key=lambda axes: own[axes]) for name, own in scores.items()}
     return {
@@ -130,7 +129,7 @@ def dissenting(scores: Mapping[str, Scores], usual: UpFront) -> dict[str, UpFron
 
 
 def are_known(scores: Mapping[str, Scores]) -> bool:
-    """Whether a prior seems to know the kind of some meshes.
+    """Whether meshes seem to be of a kind that the prior was trained on.
 
     Args:
         scores: Scores of each mesh, by its name.

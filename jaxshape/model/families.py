@@ -59,9 +59,9 @@ class Family(NamedTuple):
             spread.
         params: `variables -> ` parameters of the shape model.
         variables: The inverse of `params`.
-        architecture_of: Sizes of the network that parameters of the shape model are of.
-        codes_are_normal: Whether codes have mean 0 and covariance 1 by the way they are trained, so
-            that their statistics need not be measured.
+        architecture_of: `parameters of the shape model -> ` sizes of the network.
+        codes_are_normal: Whether training gives the codes mean 0 and covariance 1, so that their
+            statistics need not be measured.
     """
 
     model: ShapeModel
@@ -81,7 +81,7 @@ def family_of(architecture: Architecture | Completion) -> Family:
 def cross_entropy(
     logits: Float[Array, "b x y z"], batch: Batch, config: TrainConfig
 ) -> Float[Array, ""]:
-    """Mean cross-entropy with the complete surfaces, weighted as the settings say."""
+    """Mean cross-entropy with the complete surfaces, weighted according to the settings."""
     weights = jnp.where(batch.surface, config.occupied_weight, 1.0)
     weights *= 1 + (config.occluded_weight - 1) * batch.occluded
     return jnp.mean(weights * optax.sigmoid_binary_cross_entropy(logits, batch.surface))
@@ -122,10 +122,11 @@ AUTOENCODERS = Family(
 def completion_cost(variables, batch: Batch, noise, config: TrainConfig, axis) -> Cost:
     """The evidence bound of a conditional variational auto-encoder.
 
-    Some examples decode the first code, 0, which must be the best answer without a search. The
-    others decode a sample of the posterior and pay its divergence from the normal distribution.
+    Some examples decode the first code, 0, which must give the best prediction without a search.
+    The others decode a sample of the posterior, and its divergence from the normal distribution is
+    added.
     """
-    del axis  # no statistics over the batch
+    del axis  # no batch statistics
     dtype = jnp.bfloat16 if config.bfloat16 else jnp.float32
     params = variables["params"]
     mean, log_variance = completion.posterior(params, batch.grids, batch.surface, dtype)

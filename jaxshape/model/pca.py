@@ -1,4 +1,4 @@
-"""Principal components of the training grids: the cheap rival of every network.
+"""Principal components of the training grids: the inexpensive baseline for every network.
 
 A shape is the mean grid plus `d` components, `p = mean + code @ components`, and its logits are
 `slope (p - 1/2)`. The first code is the most probable one given the voxels that were measured: the
@@ -15,10 +15,11 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.model.shapes import Prepared, ShapeModel, ShapePrior
 
 PASSES = 4
-"""Power iterations of the randomised decomposition: the spectrum of shapes falls slowly."""
+"""Power iterations of the randomised decomposition; shapes need several, as their spectrum decays
+slowly."""
 
 OVERSAMPLING = 10
-"""Directions that are iterated besides the components that are kept (Halko et al., 2011)."""
+"""Directions iterated in addition to the components that are kept (Halko et al., 2011)."""
 
 
 def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
@@ -40,7 +41,7 @@ def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
 
 
 def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y z"]:
-    """Logits of the grids that codes stand for."""
+    """Logits of the grids of codes."""
     params = prepared.shared
     p = params["mean"] + jnp.einsum(
         "nd,dxyz->nxyz", code.astype(params["mean"].dtype), params["components"]
@@ -49,7 +50,7 @@ def decode(prepared: Prepared, code: Float[Array, "n d"]) -> Float[Array, "n x y
 
 
 def shapes(params: PyTree) -> PyTree:
-    """The arrays, as shapes, of a basis with as many components of as many voxels."""
+    """Expected shapes of all arrays, for a basis with this number of components and voxels."""
     d, *grid = params["components"].shape
     sizes = {"components": (d, *grid), "mean": grid, "variances": (d,), "slope": (), "noise": ()}
     if len(set(grid)) != 1 or len(grid) != 3:
@@ -66,7 +67,7 @@ def fit(surfaces: Bool[np.ndarray, "n x y z"], code: int, seed: int = 0) -> Shap
 
     Args:
         surfaces: Occupancy grids of the training set `[n x y z]`, more than `code` of them.
-        code: Components to keep, the numbers in a code.
+        code: Components to keep, which is the dimension of a code.
         seed: Seed of the randomised decomposition.
 
     Returns:

@@ -1,11 +1,12 @@
-"""The seam of every shape space: a model is three pure functions over a pytree of parameters.
+"""The interface of every shape space: three pure functions over a pytree of parameters.
 
     first code = encode(params, grids)            F and M to a code, once per object
     prepared   = prepare(params, grids, precision)  everything independent of the code, once
     logits     = decode(prepared, codes)            thousands of times
 
 Code outside `jaxshape.model` reaches a network through the `ShapeModel` that a `ShapePrior` carries
-with its parameters. `autoencoder` and `pca` are members; docs/examples has one of yours.
+with its parameters. `autoencoder` and `pca` are such models; docs/examples shows how to write your
+own.
 """
 
 from collections.abc import Callable
@@ -25,8 +26,8 @@ from jaxshape.model.chunks import in_chunks
 from jaxshape.model.config import Precision
 
 EXAMPLES_AT_A_TIME = 8
-"""Codes or grids that go through a model together on CPU: enough rows for its matrix products, few
-enough that temporaries stay small."""
+"""Number of codes or grids that go through a model together on CPU: enough for efficient matrix
+products, few enough that temporaries stay small."""
 
 
 class Prepared(NamedTuple):
@@ -44,7 +45,7 @@ class Prepared(NamedTuple):
 
 
 def share_all(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
-    """The `prepare` of models that have nothing to prepare: the parameters as they are."""
+    """The `prepare` of models that have nothing to prepare: it returns the parameters unchanged."""
     del grids, precision
     return Prepared(params)
 
@@ -62,11 +63,11 @@ class ShapeModel:
         prepare: `(params, grids [b ...] | None, precision) -> Prepared`, called once per search.
             `precision` is the precision of the decoder's matrix products. A model that decodes from
             the code alone ignores the grids, and works without any.
-        shapes: `params -> ` the same tree of `jax.ShapeDtypeStruct`, for a model of the sizes that
-            the parameters seem to have; loading compares weights files with it. None compares only
-            the results of `encode` and `decode`.
+        shapes: `params -> ` a tree of `jax.ShapeDtypeStruct` with the same structure, for a model
+            of the sizes that the parameters suggest; loading compares weights files with it. None
+            compares only the results of `encode` and `decode`.
         conditional: Whether `prepare` needs the grids: the decoder takes the measurement, so that
-            its first code accounts for it already.
+            the decoded first code already agrees with it.
     """
 
     kind: str
@@ -86,7 +87,7 @@ class ShapePrior(NamedTuple):
         code_mean: Mean code of the training set `[d]`.
         code_covariance: Covariance of the codes of the training set `[d d]`, positive definite. It
             sets the scale of the steps of a search.
-        calibration: What its logits are worth as probabilities; None where nobody has measured it.
+        calibration: Map from logits to calibrated probabilities; None if it was not fitted.
     """
 
     model: ShapeModel
@@ -97,7 +98,7 @@ class ShapePrior(NamedTuple):
 
     @property
     def code_size(self) -> int:
-        """Numbers in a code, d."""
+        """Dimension of a code, d."""
         return self.code_mean.shape[-1]
 
     @property
@@ -124,7 +125,7 @@ def _resolution(model: ShapeModel, structure: Any, kinds: tuple[Any, ...], code_
 
 
 def encode(prior: ShapePrior, grids: Grids) -> Float[Array, "*batch d"]:
-    """The code that a model proposes for a measurement: the start of a search (section 3.1).
+    """The code that a model predicts from a measurement: the start of a search (section 3.1).
 
     Args:
         prior: The shape prior.
@@ -147,7 +148,7 @@ def encode(prior: ShapePrior, grids: Grids) -> Float[Array, "*batch d"]:
 def decode(
     prior: ShapePrior, code: Float[Array, "*batch d"], grids: Grids | None = None
 ) -> Float[Array, "*batch x y z"]:
-    """**Logits** of the occupancy that codes stand for; occupied where positive.
+    """**Logits** of the occupancy grids of codes; occupied where positive.
 
     The paper's output in (0, 1) is `jax.nn.sigmoid(logits)`.
 
@@ -198,7 +199,7 @@ def pick(tree: PyTree, index: Int[Array, "*n"] | int) -> PyTree:
 
 
 def _a_few_at_a_time(function: Callable[[Int[Array, " n"]], Any], count: int) -> Any:
-    """A function of the numbers of rows, on CPU for a few rows at a time."""
+    """Apply a function to all row indices, on CPU to a few rows at a time."""
     chunked = partial(in_chunks, function, EXAMPLES_AT_A_TIME)
     return lax.platform_dependent(jnp.arange(count), cpu=chunked, default=function)
 

@@ -19,7 +19,8 @@ from jaxshape.model.convolution import matmul
 
 SIZE = 3
 CACHE_BYTES = 2**19
-"""Gathered neighbours on CPU are kept near this: of 1/2 to 4 MiB the best for most layers."""
+"""Approximate size of the gathered neighbours on CPU: the fastest for most layers among 1/2 to 4
+MiB."""
 
 
 @jax.custom_vjp
@@ -91,7 +92,7 @@ def _in_cache(grid) -> int:
 
 
 def _transposed(x: Float[Array, "*batch c"]) -> Float[Array, "c n"]:
-    """Rows of channels, really moved: XLA's products of a transposed view are 3 times slower."""
+    """The transpose as a copy: XLA's products of a transposed view are 3 times slower."""
     return jnp.moveaxis(x, -1, 0).reshape(x.shape[-1], -1)
 
 

@@ -1,13 +1,14 @@
-"""Doubling a grid by fast convolution of tiles, after Toom, Cook and Winograd.
+"""Upsample a grid by fast convolution of tiles, after Toom, Cook and Winograd.
 
 Along x and y, tiles of 4 coarse voxels and their neighbours are evaluated at 6 points, multiplied
 there with the kernel, and interpolated: `A [(G kernel) * (B coarse)]` (Lavin and Gray, "Fast
 algorithms for convolutional neural networks", 2016, F(4, 3)). Both phases of the fine grid share
-the evaluations, so that an axis takes 3 multiplications per coarse voxel where the definition has
-5. Along z, neighbours are gathered: transforming a third axis costs more traffic than it saves.
+the evaluations, so that an axis takes 3 multiplications per coarse voxel instead of the 5 of direct
+convolution. Along z, neighbours are gathered: transforming a third axis costs more traffic than it
+saves.
 
-Rounding grows tenfold, to 1e-5 of the largest value in float32, which is what it always computes
-in: bfloat16 would leave no more than two digits.
+Rounding errors grow tenfold, to 1e-5 of the largest value in float32. It always computes in
+float32: bfloat16 would leave at most two correct digits.
 """
 
 from collections.abc import Sequence
@@ -45,7 +46,7 @@ NEIGHBOURS = np.zeros((2, 3, 5), np.float32)
 NEIGHBOURS[0, [0, 1, 2], [4, 2, 0]] = 1
 NEIGHBOURS[1, [1, 2], [3, 1]] = 1
 G = np.einsum("us,psk->upk", POWERS, NEIGHBOURS)
-"""From the five taps to the values, at each point, of the three neighbours of each phase."""
+"""Matrices from the five taps to the kernel's value at each point, by phase and neighbour."""
 
 
 def transform_kernel(
@@ -64,7 +65,7 @@ def transform_kernel(
 def _along(matrix: Float[np.ndarray, "*new 5"], kernel: Array, axis: int) -> Array:
     """A small constant matrix times one axis of a kernel; the new axes come first.
 
-    Written out: arrays that a program holds as constants cannot be batched with it.
+    It is written out as sums, since constant arrays of a program cannot be batched with it.
     """
     taps = [jax.lax.index_in_dim(kernel, i, axis, keepdims=False) for i in range(5)]
     rows = _combine(matrix.reshape(-1, 5), taps, axis=0)
@@ -103,7 +104,7 @@ def _combine(matrix: np.ndarray, terms: Sequence[Array], axis: int) -> Array:
 def downsample_tiles(
     fine: Float[Array, "b x y z fine"], matrices: Float[Array, "36 rows columns"]
 ) -> Float[Array, "b x//2 y//2 z//2 {matrices.shape[-2]//3}"]:
-    """Convolve with a transformed kernel: the adjoint of `upsample_tiles` by its grid."""
+    """Convolve with a transformed kernel: the adjoint of `upsample_tiles` in its grid."""
     b, *sizes, _ = fine.shape
     coarse = jnp.zeros((b, *[n // 2 for n in sizes], matrices.shape[1] // 3), jnp.float32)
     up = lambda coarse: upsample_tiles(coarse, matrices)  # noqa: E731
@@ -113,7 +114,7 @@ def downsample_tiles(
 def gradient_of_tiles(
     fine: Float[Array, "b x y z fine"], coarse: Float[Array, "b _ _ _ coarse"]
 ) -> Float[Array, "36 3*coarse 8*fine"]:
-    """Gradient by the transformed kernel: the adjoint of `upsample_tiles` by its matrices."""
+    """Gradient in the transformed kernel: the adjoint of `upsample_tiles` in its matrices."""
     shape = (POINTS**2, 3 * coarse.shape[-1], 8 * fine.shape[-1])
     matrices = jnp.zeros(shape, jnp.float32)
     up = lambda matrices: upsample_tiles(coarse, matrices)  # noqa: E731

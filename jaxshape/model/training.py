@@ -1,8 +1,8 @@
 """Training a network to complete partial grids (paper, section 2.3).
 
-`train` yields after every report, so that the caller draws progress; everything it needs to go on
-after a kill is in the checkpoint, and a run that was killed and resumed ends with the same weights
-as one that was not: batches depend on the seed and the step alone.
+`train` yields after every report, so that the caller can show progress. The checkpoint holds
+everything that is needed to resume. A run that was killed and resumed ends with the same weights as
+an uninterrupted one, because batches depend only on the seed and the step.
 """
 
 import json
@@ -94,13 +94,13 @@ def optimizer_for(config: TrainConfig) -> optax.GradientTransformation:
         return optax.adam(schedule, b1=0.9, b2=0.999)
     return muon(
         schedule,
-        consistent_rms=0.2,  # moves of about the size that Adam makes at this step size
+        consistent_rms=0.2,  # updates about as large as those of Adam at this step size
         muon_weight_dimension_numbers=partial(jax.tree.map, _as_matrix),
     )
 
 
 def _as_matrix(weights: Array) -> MuonDimensionNumbers | None:
-    """A kernel as a matrix from all but its last axis to that; no matrix for biases and scales."""
+    """Treat a kernel as a matrix from its other axes to the last; None for biases and scales."""
     axes = tuple(range(weights.ndim - 1))
     return MuonDimensionNumbers(axes, weights.ndim - 1) if weights.ndim > 1 else None
 
@@ -110,7 +110,7 @@ def initial_state(config: TrainConfig, start: ShapePrior | None = None) -> Train
 
     Args:
         config: Settings of the run.
-        start: Shape prior to go on from; None for random weights.
+        start: Shape prior to continue training from; None for random weights.
 
     Raises:
         ValueError: The weights to start from are of another model or of other sizes.
@@ -124,7 +124,7 @@ def initial_state(config: TrainConfig, start: ShapePrior | None = None) -> Train
             f"the run is of {family.model.kind!r}; give weights of that kind."
         )
     elif family.architecture_of(start.params) == config.architecture:
-        # A copy: steps give theirs away.
+        # A copy, because the training step donates its buffers.
         variables = family.variables(jax.tree.map(jnp.array, start.params))
     else:
         raise ValueError(
@@ -143,8 +143,8 @@ def train_step(
 ) -> tuple[TrainState, tuple[Float[Array, ""], Float[Array, ""]]]:
     """One step of the optimiser on a batch.
 
-    Where the batch is spread over devices, each holds its part, and statistics, gradients and
-    figures cover the whole batch.
+    If the batch is spread over devices, each device holds a part of it; statistics, gradients and
+    metrics still cover the whole batch.
 
     Args:
         state: State before the step.
@@ -177,7 +177,7 @@ def train_step(
 
 
 def _noise(step, count, config: TrainConfig, axis):
-    """Noise for each code of this device's part; a function of its place in the whole batch."""
+    """Noise for each code of this device; it depends on the code's index in the whole batch."""
     key = jax.random.fold_in(jax.random.key(config.seed + 1), step)
     first = lax.axis_index(axis) * count if axis else 0
     keys = jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(count))
@@ -189,8 +189,8 @@ def batch_of(
 ) -> Batch:
     """The training pairs of one step; a function of the seed and the step.
 
-    Objects come in a new order each epoch, and each pair has random numbers of its own, so that
-    `part` i of n of a batch equals its rows of the whole batch.
+    Objects come in a new order each epoch. Each pair has its own random numbers, so that `part` (i,
+    n), the i-th of n parts, equals the same rows of the whole batch.
     """
     count, (index, parts) = len(dataset.names) - validation_size(dataset, config), part
     size = config.batch // parts
@@ -222,7 +222,7 @@ def validation_size(dataset: Dataset, config: TrainConfig) -> int:
 
 
 def validation_batch(dataset: Dataset, config: TrainConfig) -> Batch | None:
-    """One input of each object that is kept out of training; None where none is."""
+    """One input of each object that is kept out of training; None if there is no such object."""
     count = len(dataset.names)
     kept = range(count - validation_size(dataset, config), count)
     rngs = (np.random.default_rng((config.seed, 2, index)) for index in kept)
@@ -253,18 +253,17 @@ def train(
     config: TrainConfig,
     start: ShapePrior | None = None,
 ) -> Iterator[Report]:
-    """Train until `config.steps`, from the checkpoint in the folder where there is one. [host]
+    """Train until `config.steps`, resuming from the folder's checkpoint if there is one. [host]
 
-    Each batch is spread over all devices, of all processes where there are several
-    (`jax.distributed`): each process reads its own part of the dataset, and the first alone reads
-    and writes the folder. Adds to `metrics.jsonl` and replaces `checkpoint.safetensors` at every
-    report.
+    Each batch is spread over all devices of all processes (`jax.distributed`): each process reads
+    its own part of the dataset, and only the first reads and writes the folder. Adds to
+    `metrics.jsonl` and replaces `checkpoint.safetensors` at every report.
 
     Args:
         folder: Folder of the run; made if missing.
         dataset: Training pairs, of the resolution of the network.
         config: Settings of the run.
-        start: Shape prior to go on from; None for random weights.
+        start: Shape prior to continue training from; None for random weights.
 
     Yields:
         A report after every `config.report_every` steps and after the last.
@@ -320,7 +319,7 @@ def _parallel_step(config: TrainConfig, mesh: Mesh):
         mesh=mesh,
         in_specs=(P(), P("batch")),
         out_specs=P(),
-        check_vma=False,  # the convolutions' own derivatives do not say how they vary
+        check_vma=False,  # custom derivatives of the convolutions do not declare how they vary
     )
     return jax.jit(step, donate_argnums=0)
 
@@ -350,7 +349,7 @@ def finished_prior(
         folder: Folder of the run.
         dataset: The training pairs.
         config: Settings of the run.
-        samples: Codes from which the statistics are computed, at most.
+        samples: Largest number of codes from which the statistics are computed.
     """
     state = _read_checkpoint(Path(folder) / "checkpoint.safetensors", config)
     family = family_of(config.architecture)
@@ -366,7 +365,7 @@ def finished_prior(
         [encode_batch(prior, batch_of(dataset, many, step)) for step in range(steps)]
     )
     covariance = np.cov(codes, rowvar=False)
-    # Directions no code uses keep a little room to search in.
+    # Directions in which the codes do not vary keep a small variance for the search.
     covariance += 1e-3 * np.trace(covariance) / d * np.eye(d)
     return prior._replace(
         code_mean=jnp.asarray(codes.mean(0)), code_covariance=jnp.asarray(covariance, jnp.float32)
@@ -374,14 +373,14 @@ def finished_prior(
 
 
 def save_checkpoint(folder: Path, state: TrainState, run: str) -> None:
-    """Replace the checkpoint of a run, atomically; `run` tells it from others."""
+    """Replace the checkpoint of a run, atomically; `run` identifies the run."""
     tensors = {name: np.asarray(x) for name, x in flatten(state).items()}
     with atomic_path(folder / "checkpoint.safetensors") as temporary:
         save_file(tensors, temporary, {"run": run})
 
 
 def _identity(config: TrainConfig, start: ShapePrior | None) -> str:
-    """Settings and start of a run, which its checkpoint must share."""
+    """Settings and start of a run, as text; its checkpoint must have the same."""
     return json.dumps(asdict(config) | {"start": start and fingerprint(start)})
 
 
@@ -390,7 +389,8 @@ def _agreed_state(
 ) -> TrainState:
     """The state of the checkpoint, or the initial one where there is none, for all processes.
 
-    The first process looks, since the others may not see its disk; all refuse together.
+    Only the first process reads the folder, since the others may not have access to its disk; an
+    error is raised in all processes.
     """
     share, is_first = multihost_utils.broadcast_one_to_all, jax.process_index() == 0
     path = folder / "checkpoint.safetensors"
@@ -413,7 +413,7 @@ def _run_of(checkpoint: Path) -> str | None:
 
 @contextmanager
 def _opened(checkpoint: Path) -> Iterator[Any]:
-    """A checkpoint for the block that reads it; `ValueError` if it is damaged."""
+    """Open a checkpoint for the block that reads it; raises `ValueError` if it is damaged."""
     try:
         with reading.opened(checkpoint, limits.WEIGHT_BYTES), safe_open(checkpoint, "np") as file:
             yield file
@@ -447,7 +447,7 @@ def read_metrics(folder: str | os.PathLike[str]) -> list[Report]:
 
 
 def _record(folder: Path, report: Report) -> None:
-    """Add a report to the metrics, in place of any from steps that a kill made to be repeated."""
+    """Add a report to the metrics; it replaces reports of steps that are repeated after a kill."""
     reports = [r for r in read_metrics(folder) if r.step < report.step] + [report]
     lines = (json.dumps(r._asdict()) + "\n" for r in reports)
     write_text(folder / "metrics.jsonl", "".join(lines))

@@ -27,13 +27,13 @@ from jaxshape.model.shapes import ShapeModel, ShapePrior, resolution_of
 FORMAT = "jaxshape-shape-prior-1"
 
 FORMAT_IN_BYTES = "jaxshape-shape-prior-2"
-"""Each array of 8 bits has an array of factors: one for each channel of its last axis."""
+"""Format in which each 8-bit array has an array of factors, one per channel of its last axis."""
 
 FACTORS = "factors/"
 """Prefix of the names of these factors."""
 
 BYTE_STEPS = 127
-"""Steps of 8 bits from 0 to the largest weight of a channel."""
+"""Quantisation steps of an 8-bit weight from 0 to the largest weight of its channel."""
 
 LEAST_IN_BYTES = 4096
 """Arrays of fewer numbers stay in half precision."""
@@ -42,26 +42,26 @@ MODELS = {model.kind: model for model in (AUTOENCODER, COMPLETION, PCA)}
 """The kinds of shape models that come with the package."""
 
 PACKAGED = ("chair", "chair-autoencoder")
-"""Weights that come with the package: of the network that is conditioned on the measurement, and of
-the paper's auto-encoder."""
+"""Names of the weights that come with the package: the network that is conditioned on the
+measurement, and the paper's auto-encoder."""
 
 
 CLASSES = ("chair", "table")
-"""Classes whose weights come with the package, where they are among `PACKAGED`."""
+"""Classes of the package; their weights come with it if they are among `PACKAGED`."""
 
 
 def load_scene_priors(
     further: Mapping[str, str | os.PathLike[str]],
 ) -> tuple[dict[str, ShapePrior], dict[str, ShapePrior]]:
-    """The priors of all classes that a scene may hold, and those that find their boxes. [host]
+    """Load the priors of all classes that a scene may hold, and the priors that find boxes. [host]
 
     Args:
-        further: Weights of further classes, or of the package's classes in place of its own, by the
-            name of the class.
+        further: Weights by class name, of further classes or as replacements for the package's own
+            weights.
 
     Returns:
-        The priors, and the priors that find boxes, by the name of the class; a class that is not
-        among the latter is placed by its own prior.
+        The priors, and the priors that find boxes, both by class name. For a class without the
+        latter, its own prior finds the boxes.
 
     Raises:
         WeightsError: A file cannot be read.
@@ -77,7 +77,7 @@ def load_scene_priors(
 
 
 def packaged_for(family: str) -> str:
-    """The package's weights for a family of objects; the chairs' where the family has none of its
+    """The package's weights for a family of objects; those for chairs if it has no weights of its
     own."""
     return family if family in PACKAGED else "chair"
 
@@ -100,8 +100,8 @@ def save_prior(
         prior: The shape prior to write; its parameters are a tree of dictionaries. The kind of its
             model is written beside them.
         card: The model card: a dictionary of anything that JSON can hold.
-        in_bytes: Round the weights of each channel to 127 steps of their largest instead of to half
-            precision: a file of half the size, for which our networks lose less than 0.001 of IoU.
+        in_bytes: Round the weights of each channel to 1/127 of the largest one, instead of to half
+            precision. The file is half as large, and our networks lose less than 0.001 of IoU.
     """
     tensors = {}
     for name, x in flatten(prior.params).items():
@@ -153,7 +153,7 @@ def load_prior(
     mean, covariance = tensors.pop("code_mean", None), tensors.pop("code_covariance", None)
     calibration = _calibration(tensors.pop("calibration", None), where)
     # Converted by NumPy: JAX would compile a program for each shape.
-    with np.errstate(over="ignore"):  # what is too large is found to be infinite below
+    with np.errstate(over="ignore"):  # values that overflow are found to be infinite below
         named = {name: jnp.asarray(x) for name, x in _weights(tensors, where).items()}
     try:
         params = unflatten(named)
@@ -215,7 +215,7 @@ def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
 
 
 def fingerprint(prior: ShapePrior) -> str:
-    """A hash of all numbers of a shape prior: the same for the same weights, wherever they lie."""
+    """A hash of all numbers of a shape prior, which does not depend on where the file is stored."""
     digest = hashlib.sha256()
     for name, x in flatten(prior).items():
         digest.update(name.encode())
@@ -291,7 +291,7 @@ def _check(model: ShapeModel, params: PyTree, mean, covariance, path: Path) -> N
 
 
 def _wrong_shape(model: ShapeModel, params: PyTree) -> str | None:
-    """A few words on the first parameter of a wrong shape; None where all are right."""
+    """Description of the first parameter of a wrong shape; None if all shapes are right."""
     if model.shapes is None:
         return None
     try:
@@ -307,7 +307,7 @@ def _wrong_shape(model: ShapeModel, params: PyTree) -> str | None:
 
 
 def _wrong_statistics(model: ShapeModel, params: PyTree, mean, covariance) -> str | None:
-    """A few words on statistics of a wrong shape; None where all are right."""
+    """Description of statistics of a wrong shape; None if all shapes are right."""
     if mean is None or covariance is None:
         return "the codes' mean or covariance is missing"
     if mean.ndim != 1 or covariance.shape != mean.shape * 2:
