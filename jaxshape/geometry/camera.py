@@ -60,8 +60,8 @@ def project(
 ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
     """Project camera-frame points into the image.
 
-    Points at or behind the camera plane get finite but meaningless image coordinates; their depth
-    tells them apart.
+    Points at or behind the camera plane get finite but meaningless image coordinates; recognise
+    them by their depth, which is 0 or below.
 
     Args:
         intrinsics: The camera.
@@ -84,8 +84,8 @@ def unproject(
 
     Args:
         intrinsics: The camera.
-        depth: Depth image `[*batch h w]`, in metres; 0 where nothing is known, infinite where the
-            ray met nothing.
+        depth: Depth image `[*batch h w]`, in metres; 0 for missing depth, infinite where the ray
+            hit nothing.
 
     Returns:
         Points `[*batch h w 3]`, in metres; 0 for pixels of depth 0, infinite for pixels of infinite
@@ -101,14 +101,14 @@ def unproject(
 def look_up(
     image: Float[Array, "h w *channels"], pixels: Float[Array, "*batch 2"]
 ) -> Float[Array, "..."]:
-    """The values of an image at the pixels in which image points lie.
+    """The values of an image at the pixels that contain the given image points.
 
     Args:
         image: Any number of values for each pixel, for example a depth image or an image of points.
         pixels: Image coordinates `(u, v)`, in pixels.
 
     Returns:
-        The values `[*batch *channels]`; 0, for nothing known, outside the image.
+        The values `[*batch *channels]`; 0 outside the image.
     """
     h, w = image.shape[:2]
     column, row = pixels[..., 0], pixels[..., 1]
@@ -118,9 +118,9 @@ def look_up(
 
 
 def transform(T_a_b: jaxlie.SE3, points: Float[Array, "*batch n 3"]) -> Float[Array, "*batch n 3"]:
-    """Take points of frame b to frame a.
+    """Transform points from frame b to frame a.
 
-    For whole clouds a product with a matrix is faster than one with quaternions.
+    For whole clouds, multiplying by a matrix is faster than by quaternions.
 
     Args:
         T_a_b: Pose of frame b in frame a.

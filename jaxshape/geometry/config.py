@@ -1,6 +1,6 @@
-"""Names of the ways in which frames are fused.
+"""Names of the fusion methods.
 
-Nothing here imports JAX, so that the command line answers at once.
+Nothing here imports JAX, so that the command line starts quickly.
 """
 
 from typing import Literal

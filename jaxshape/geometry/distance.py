@@ -2,13 +2,13 @@
 
 One frame gives a `DistanceField`; two fields of the same object merge into one. Merging adds, so
 that it is associative and commutative up to rounding, with `nothing_measured()` as its identity:
-frames can be added one at a time, all at once, or cumulatively. Unlike points counted into voxels,
-distances average a sensor's noise away.
+frames can be added one at a time, all at once, or cumulatively. Unlike counts of points in voxels,
+distances average out the noise of a sensor.
 
-Two things keep thin parts alive. Behind a surface, where a frame knows nothing, its distances count
-only within a narrow band and less with every millimetre, so that a plate seen from both sides keeps
-both. Space that rays passed through is counted apart, so that rays passing a chair leg do not shift
-its surface.
+Two measures preserve thin parts. Behind a surface, where a frame has no information, its distances
+count only within a narrow band, with a weight that falls with the distance, so that a plate seen
+from both sides keeps both surfaces. Space that rays passed through is counted separately, so that
+rays passing a chair leg do not shift its surface.
 """
 
 from typing import NamedTuple
@@ -22,16 +22,17 @@ from jaxshape.geometry.grid import RESOLUTION, GridFrame
 from jaxshape.geometry.pixels import Sensor, SurfacePixels, pack, surface_pixels, unpack
 
 FINE = 4
-"""Fine voxels along each side of a voxel of the shape: 8 mm of a chair, and 24 MiB of numbers. With
-3, F is .01 to .02 worse after 1 to 18 frames, and a frame takes 10 ms of processor time, not 28."""
+"""Fine voxels along each side of a voxel of the shape: for a chair they are 8 mm wide and take 24
+MiB. With 3, F is .01 to .02 worse after 1 to 18 frames, and a frame takes 10 ms of processor time
+instead of 28."""
 
 
 class Band(NamedTuple):
-    """A distance from the surface: the greater of some fine voxels and some deviations of depth.
+    """A distance from the surface: the larger of a number of fine voxels and of depth deviations.
 
     Attributes:
-        voxels: Fine voxels, in their longest edge.
-        deviations: Standard deviations of the depth measured there.
+        voxels: Number of fine voxels; the longest edge of a voxel counts.
+        deviations: Number of standard deviations of the depth measured there.
     """
 
     voxels: float
@@ -39,9 +40,9 @@ class Band(NamedTuple):
 
 
 FRONT, BEHIND, CLEAR = Band(3.0, 3.0), Band(1.8, 2.0), Band(1.0, 2.0)
-"""Width of the band in front of a surface and of the fading band behind it, and the distance in
-front of it beyond which space is certainly free. Plates of 2 cm seen from both sides keep their
-thickness to 0.3 mm."""
+"""Width of the band in front of a surface, width of the band behind it in which the weight fades,
+and the distance in front of the surface beyond which space is certainly free. Plates of 2 cm seen
+from both sides keep their thickness to 0.3 mm."""
 
 
 class DistanceField(NamedTuple):
@@ -50,8 +51,9 @@ class DistanceField(NamedTuple):
     Attributes:
         weighted_distance: Sum over frames of weight times signed distance, in metres; positive in
             front of the surface, negative behind it.
-        weight: Sum over frames of the weight of a measured surface nearby, about 1 at most for each
-            frame: less for surfaces that are far away, that are seen aslant, or that lie in front.
+        weight: Sum over frames of the weight of a measured surface nearby, at most about 1 for each
+            frame: less for distant surfaces, for surfaces seen at a slant, and for surfaces in
+            front of the voxel.
         free: Sum over frames of the certainty, 0 to 1, that a ray passed through the voxel.
     """
 
@@ -61,7 +63,7 @@ class DistanceField(NamedTuple):
 
 
 def nothing_measured(resolution: int = FINE * RESOLUTION) -> DistanceField:
-    """The field of no frames."""
+    """The field before any frame."""
     return DistanceField(*[jnp.zeros((resolution,) * 3)] * 3)
 
 
@@ -81,16 +83,16 @@ def measure(
 ) -> DistanceField:
     """Signed distances from the surface that one depth frame shows.
 
-    Every fine voxel looks up the pixel that its centre projects to, so that a pixel is a patch and
-    a coarse image leaves no holes. Its distance is measured to the plane through the pixel's
-    surface.
+    Every fine voxel looks up the pixel that its centre projects to: a pixel covers a patch of
+    surface, and a low-resolution image leaves no holes. The distance is that to the plane fitted at
+    the pixel.
 
     Args:
-        depth: Metres; 0 where nothing is known, infinite where the ray met nothing.
-        segmented: True on pixels that show the object. Other pixels make no surface; every valid
-            pixel frees the space in front of it.
+        depth: Depth image, in metres; 0 for missing depth, infinite where the ray hit nothing.
+        segmented: True on pixels that show the object. Other pixels give no surface; every valid
+            pixel marks the space in front of it as free.
         intrinsics: Camera of the depth image.
-        T_object_camera: Camera to object.
+        T_object_camera: Pose of the camera in the object frame.
         frame: Frame of the grid of shapes, 32 voxels along each side.
         sensor: Noise of the camera, which decides weights and bands.
         resolution: Fine voxels along each side.
@@ -101,8 +103,8 @@ def measure(
     fine = fine_frame(frame, resolution)
     index, z = _project(intrinsics, T_object_camera, fine, resolution, depth.shape)
     pixels = surface_pixels(depth, segmented, intrinsics, sensor)
-    # The last entry stands for everything outside the image. A scatter writes it: XLA does not fuse
-    # across scatters; without one it would fit a plane for every voxel.
+    # The last entry stands for everything outside the image. It is written by a scatter, because
+    # XLA does not fuse across scatters: without one it would fit a plane for every voxel.
     packed = jnp.append(pack(pixels), jnp.uint32(0))
     packed = packed.at[jnp.full(2, depth.size)].set(jnp.uint32(0))
     found = unpack(packed.at[index].get(mode="promise_in_bounds"))
@@ -118,7 +120,7 @@ def _project(
 ) -> tuple[Int[Array, "x y z"], Float[Array, "x y z"]]:
     """The pixel, as an index of the raveled image, and the depth of each fine voxel's centre.
 
-    Voxels outside the image get the index after the last.
+    Voxels outside the image get the index after that of the last pixel.
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_object_camera.rotation().as_matrix(), T_object_camera.translation()
@@ -138,7 +140,7 @@ def _project(
 def _field(
     found: SurfacePixels, z: Float[Array, "x y z"], size: Float[Array, ""], sensor: Sensor
 ) -> DistanceField:
-    """The field from the pixels that voxels looked up, their own depth, and their size."""
+    """The field of voxels, from the pixels they project to, their own depth, and their size."""
     sigma = sensor.axial * z**2
     ahead = found.depth - z  # along the optical axis
     distance = ahead * found.slope
@@ -157,7 +159,7 @@ def _band(
 
 
 def merge(first: DistanceField, second: DistanceField) -> DistanceField:
-    """The field of both sets of frames."""
+    """Merge the fields of two sets of frames."""
     return DistanceField(*(a + b for a, b in zip(first, second, strict=True)))
 
 

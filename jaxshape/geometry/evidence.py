@@ -1,7 +1,8 @@
 """Probability that each voxel of a shape is surface, free or unknown, from fine signed distances.
 
-The numbers below were fitted to procedural chairs under a Kinect's noise, after 1 to 18 frames: how
-often a voxel with so many crossings, or so much free space, holds a piece of the true surface.
+The numbers below were fitted to procedural chairs with a Kinect's noise, after 1 to 18 frames: to
+how often a voxel with a given number of crossings, or share of free space, holds a piece of the
+true surface.
 """
 
 from typing import NamedTuple
@@ -15,14 +16,14 @@ from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.geometry.grids import Grids
 
 OUTVOTED = 0.06
-"""A surface counts where its weight is more than this share of the rays that passed through it."""
+"""A surface counts if its weight is more than this share of the rays that passed through it."""
 
 ALREADY, SCALE = 2.0, 4.3
-"""Fine voxels crossed by the surface, n, make a voxel surface with 1 - exp(-(n + 2) / 4.3): already
-a single one more likely than not."""
+"""A voxel in which the surface crosses n fine voxels is surface with probability
+1 - exp(-(n + 2) / 4.3): for a single fine voxel this is above 1/2."""
 
 SOME, ALL = 0.5, 0.95
-"""Shares of free fine voxels from which a voxel begins to be free, and is free for certain."""
+"""Shares of free fine voxels above which a voxel may be free, and above which it certainly is."""
 
 
 class Evidence(NamedTuple):
@@ -30,7 +31,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         surface: Probability, 0 to 1, that the voxel holds a piece of the measured surface.
-        free: Probability, 0 to 1, that it was seen to be free; both add up to 1 at most.
+        free: Probability, 0 to 1, that the voxel was seen to be free; the sum of both is at most 1.
     """
 
     surface: Float[Array, "*batch x y z"]
@@ -41,7 +42,7 @@ def evidence(field: DistanceField, resolution: int = RESOLUTION) -> Evidence:
     """Probabilities of the voxels of a shape from a fused field.
 
     Args:
-        field: Signed distances of the fine grid, of a multiple of the resolution.
+        field: Signed distances of the fine grid, whose side is a multiple of the resolution.
         resolution: Voxels along each axis of the shape.
 
     Returns:
@@ -60,7 +61,7 @@ def is_trusted(field: DistanceField) -> Bool[Array, "*batch x y z"]:
 
 
 def crossings(field: DistanceField) -> Bool[Array, "*batch x y z"]:
-    """Fine voxels that the surface crosses: of each pair with different signs, the nearer to it."""
+    """Fine voxels that the surface crosses: in each pair of different signs, the nearer to it."""
     trusted, distance = is_trusted(field), mean_distance(field)
     crossed = jnp.zeros(distance.shape, bool)
     for axis in (-3, -2, -1):
@@ -76,10 +77,10 @@ def crossings(field: DistanceField) -> Bool[Array, "*batch x y z"]:
 
 
 def _within_margin(count: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
-    """Crossings in the outermost voxels, which the box leaves free, count for the voxels next to
-    them.
+    """Move crossings in the outermost voxels, outside the box, to the voxels next to them.
 
-    The box's own faces lie a hundredth of a voxel inside: noise alone takes a surface across.
+    The faces of the box are a hundredth of a voxel inside the next voxels: noise alone can move a
+    surface across the border.
     """
     n = count.shape[-1]
     for axis in (-3, -2, -1):
@@ -93,13 +94,13 @@ def _within_margin(count: Float[Array, "*batch x y z"]) -> Float[Array, "*batch 
 
 
 def as_grids(evidence: Evidence) -> Grids:
-    """F and M as probabilities: of surface given that a voxel is known, and of being unknown."""
+    """F, the probability of surface in a known voxel, and M, the probability of being unknown."""
     known = evidence.surface + evidence.free
     return Grids(evidence.surface / jnp.where(known > 0, known, 1), 1 - known)
 
 
 def from_grids(grids: Grids) -> Evidence:
-    """Probabilities of surface and free space in F and M, binary or soft: undoes `as_grids`."""
+    """Probabilities of surface and free space from F and M, binary or soft: inverts `as_grids`."""
     F, M = (jnp.asarray(x).astype(jnp.float32) for x in (grids.occupied, grids.occluded))
     return Evidence(F * (1 - M), (1 - F) * (1 - M))
 
@@ -113,7 +114,7 @@ def soft_grids(field: DistanceField, resolution: int = RESOLUTION) -> Grids:
         resolution: Voxels along each axis of the grids.
 
     Returns:
-        Soft grids; rounded (`binary`) they are the measurement grid and the occlusion mask.
+        Soft grids; after rounding (`binary`) they are the measurement grid and the occlusion mask.
     """
     return as_grids(evidence(field, resolution))
 

@@ -1,7 +1,7 @@
-"""The two ways in which frames become F and M, behind one interface.
+"""The two methods that fuse frames into F and M, behind one interface.
 
 `Points` counts measured points in voxels, as in the paper (Eq. 6); `Distances` averages signed
-distances on a fine grid, for depth that is real or noisy. Both are static under `jax.jit`:
+distances on a fine grid, for real or noisy depth. Both are static under `jax.jit`:
 
     state = fusing.nothing(resolution)
     state = fusing.merge(state, fusing.measure(depth, segmented, intrinsics, T, frame, sensor))
@@ -51,18 +51,18 @@ class Points:
         checks.whole("min_hits", self.min_hits, 1)
 
     def nothing(self) -> Measurement:
-        """The measurement of no frames."""
+        """The measurement before any frame."""
         return fusion.nothing_measured(self.resolution)
 
     def measure(
         self, depth, segmented, intrinsics, T_object_camera, frame, sensor: Sensor = Sensor()
     ) -> Measurement:
-        """The measurement of one frame; points have no weights, so the sensor does not count."""
+        """The measurement of one frame; points have no weights, so the sensor is ignored."""
         del sensor
         return fusion.measure(depth, segmented, intrinsics, T_object_camera, frame, self.resolution)
 
     def merge(self, first: Measurement, second: Measurement) -> Measurement:
-        """The measurement of both sets of frames."""
+        """Merge the measurements of two sets of frames."""
         return fusion.merge(first, second)
 
     def grids(self, state: Measurement) -> Grids:
@@ -82,7 +82,7 @@ class Distances:
             least multiple that is 4 times 32 or more.
 
     Raises:
-        ValueError: The fine grid is not a multiple of the other.
+        ValueError: The side of the fine grid is not a multiple of the resolution.
     """
 
     resolution: int = RESOLUTION
@@ -100,7 +100,7 @@ class Distances:
         return self.resolution * math.ceil(distance.FINE * RESOLUTION / self.resolution)
 
     def nothing(self) -> DistanceField:
-        """The field of no frames."""
+        """The field before any frame."""
         return distance.nothing_measured(self._side)
 
     def measure(
@@ -113,7 +113,7 @@ class Distances:
         )
 
     def merge(self, first: DistanceField, second: DistanceField) -> DistanceField:
-        """The field of both sets of frames."""
+        """Merge the fields of two sets of frames."""
         return distance.merge(first, second)
 
     def grids(self, state: DistanceField) -> Grids:
@@ -122,11 +122,11 @@ class Distances:
 
 
 Fusion = Points | Distances
-"""A way to fuse frames; merging is associative and commutative, with `nothing()` as identity."""
+"""A fusion method; merging is associative and commutative, with `nothing()` as identity."""
 
 
 def fusion_named(name: FusionName, resolution: int = RESOLUTION, min_hits: int = 1) -> Fusion:
-    """A way to fuse frames by name.
+    """The fusion method of a name.
 
     Args:
         name: "distance" for signed distances, "points" for the paper's points.
@@ -134,7 +134,7 @@ def fusion_named(name: FusionName, resolution: int = RESOLUTION, min_hits: int =
         min_hits: Points that make a voxel occupied, for "points".
 
     Raises:
-        ValueError: There is none of that name, or a number is outside its range.
+        ValueError: There is no method of that name, or a number is outside its range.
     """
     checks.one_of("fusion", name, get_args(FusionName))
     return Points(resolution, min_hits) if name == "points" else Distances(resolution)
@@ -150,20 +150,20 @@ def fuse(
     sensor: Sensor = Sensor(),
     state: Any = None,
 ) -> Any:
-    """The state of all frames of one camera, added one at a time so that memory holds two fields.
+    """Fuse all frames of one camera, one at a time, so that memory holds only two fields.
 
     Args:
         fusing: The way to fuse them.
-        depth: Metres `[frame h w]`; 0 where nothing is known, infinite where the ray met nothing.
+        depth: Metres `[frame h w]`; 0 for missing depth, infinite where the ray hit nothing.
         segmented: True on pixels that show the object `[frame h w]`.
         intrinsics: The camera of all frames.
         T_object_camera: Pose of each frame in the object frame `[frame]`.
         frame: Voxel frame of F and M.
         sensor: Noise of the camera.
-        state: The state of earlier frames; None where there are none.
+        state: The state of earlier frames; None if there are none.
     """
 
-    merge: Any = fusing.merge  # of either kind, and so is the state
+    merge: Any = fusing.merge  # of either method, and so is the state
 
     def add(state, one):
         depth, segmented, T = one
@@ -189,7 +189,7 @@ def fuse_in_stages(
     Args:
         fusing: The way to fuse them.
         numbers: Increasing numbers of frames, 1 or more each.
-        depth: Metres `[frame h w]`; 0 where nothing is known, infinite where the ray met nothing.
+        depth: Metres `[frame h w]`; 0 for missing depth, infinite where the ray hit nothing.
         segmented: True on pixels that show the object `[frame h w]`.
         intrinsics: The camera of all frames.
         T_object_camera: Pose of each frame in the object frame `[frame]`.

@@ -2,7 +2,7 @@
 
 One frame gives a `Measurement`; two measurements of the same object merge into one. Merging is
 associative and commutative with `nothing_measured()` as its identity, so frames can be added one at
-a time, all at once, or cumulatively, and every way gives the same grids.
+a time, all at once, or cumulatively, always with the same grids.
 """
 
 from collections.abc import Iterable
@@ -22,8 +22,8 @@ class Measurement(NamedTuple):
 
     Attributes:
         hits: Measured surface points that fell into the voxel `[*batch x y z]`, 0 or more.
-        seen_through: True where some frame measured a surface behind the voxel's centre, or where
-            its ray met nothing `[*batch x y z]`.
+        seen_through: True if a frame measured a surface behind the voxel's centre, or if its ray
+            through the centre hit nothing `[*batch x y z]`.
     """
 
     hits: Int[Array, "*batch x y z"]
@@ -31,7 +31,7 @@ class Measurement(NamedTuple):
 
 
 def nothing_measured(resolution: int = RESOLUTION) -> Measurement:
-    """The measurement of no frames.
+    """The measurement before any frame.
 
     Args:
         resolution: Voxels along each axis.
@@ -48,13 +48,13 @@ def measure(
     frame: GridFrame,
     resolution: int = RESOLUTION,
 ) -> Measurement:
-    """Discretise one depth frame: `D(T P)` of Eq. 6, and the space it looked through.
+    """Discretise one depth frame: `D(T P)` of Eq. 6, and the free space that its rays crossed.
 
-    Only segmented pixels put points into voxels. Every valid pixel frees the space in front of it,
-    background pixels too; the space behind a foreign object stays occluded.
+    Only segmented pixels put points into voxels. Every valid pixel, also of the background, marks
+    the space in front of it as free; the space behind another object stays occluded.
 
     Args:
-        depth: Depth image `[h w]`, in metres; 0 where nothing is known, infinite where the ray met
+        depth: Depth image `[h w]`, in metres; 0 for missing depth, infinite where the ray hit
             nothing.
         segmented: True on pixels that show the object `[h w]`.
         intrinsics: The camera, without batch axes.
@@ -65,8 +65,8 @@ def measure(
     Returns:
         The measurement of this frame `[x y z]`.
     """
-    # One affine map each way, with separate arrays for the coordinates: XLA then does everything
-    # before the count or look-up in one pass, many times as fast on CPU.
+    # One affine map in each direction, with separate arrays for the coordinates: XLA then computes
+    # everything before the count or look-up in one pass, which is many times as fast on CPU.
     R, t = T_object_camera.rotation().as_matrix(), T_object_camera.translation()
     voxel_from_camera = R / frame.voxel_size[:, None], (t - frame.origin) / frame.voxel_size
     camera_from_voxel = R.T * frame.voxel_size, R.T @ (frame.origin - t)

@@ -14,8 +14,9 @@ RESOLUTION = 32
 """Voxels along each axis of every grid (paper, section 2.2)."""
 
 MARGIN = 1.01
-"""Voxels left free on each side of the object: room for noise, and for a closed surface. Not a
-whole number, or rounding would decide into which voxels the faces of the bounding box fall."""
+"""Voxels left free on each side of the object: room for noise, and for a closed surface. It is not
+a whole number, since rounding would then decide into which voxels the faces of the bounding box
+fall."""
 
 
 class GridFrame(NamedTuple):
@@ -39,10 +40,11 @@ def fit_box(
     resolution: int = RESOLUTION,
     margin: float = MARGIN,
 ) -> GridFrame:
-    """Scale each axis on its own so that the box fills the grid up to the margin.
+    """Scale each axis separately so that the box fills the grid up to the margin.
 
-    This is the anisotropic scaling and shift of the paper (section 2.3). It is made once for each
-    object, from its CAD model or its given box, and then applied unchanged to every partial view.
+    This is the anisotropic scaling and shift of the paper (section 2.3). It is computed once for
+    each object, from its CAD model or its given box, and then applied unchanged to every partial
+    view.
 
     Args:
         lower: Corner of the box with the smallest coordinates `[*batch 3]`, in the object frame, in
@@ -65,7 +67,8 @@ def fit_box_isotropic(
 ) -> GridFrame:
     """One scale for all axes: the longest side fills the grid, and the others are centred.
 
-    The paper scales so on real data (section 3.1), where only the measured points are known.
+    The paper uses this scaling on real data (section 3.1), where only the measured points are
+    known.
 
     Args:
         lower: Corner of the box with the smallest coordinates `[*batch 3]`, in the object frame, in
@@ -83,7 +86,7 @@ def fit_box_isotropic(
 def voxel_from_object(
     frame: GridFrame, points: Float[Array, "*batch n 3"]
 ) -> Float[Array, "*batch n 3"]:
-    """Take object-frame points to voxel coordinates.
+    """Transform object-frame points to voxel coordinates.
 
     Args:
         frame: Voxel frame of the grid.
@@ -95,7 +98,7 @@ def voxel_from_object(
 def object_from_voxel(
     frame: GridFrame, voxels: Float[Array, "*batch n 3"]
 ) -> Float[Array, "*batch n 3"]:
-    """Take voxel coordinates to object-frame points, in metres.
+    """Transform voxel coordinates to object-frame points, in metres.
 
     Args:
         frame: Voxel frame of the grid.
@@ -131,7 +134,8 @@ def voxel_centers(resolution: int = RESOLUTION) -> Float[Array, "n 3"]:
         resolution: Voxels along each axis.
 
     Returns:
-        Voxel coordinates of the `resolution**3` centres; `object_from_voxel` takes them to metres.
+        Voxel coordinates of the `resolution**3` centres; `object_from_voxel` converts them to
+        metres.
     """
     axis = jnp.arange(resolution) + 0.5
     return jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)

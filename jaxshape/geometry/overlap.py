@@ -14,8 +14,8 @@ def iou(
 ) -> Float[Array, "..."]:
     """Intersection over union of the occupied voxels.
 
-    |A and B| / |A or B|, with the true union, where the paper prints a sum (section 4). Two empty
-    grids agree: 1.
+    |A and B| / |A or B|, with the true union; the paper prints a sum instead (section 4). Two empty
+    grids have an IoU of 1.
 
     Args:
         predicted: Occupied voxels `[*batch x y z]`: booleans, or integers that are 0 or 1. Leading
@@ -27,7 +27,7 @@ def iou(
 
     Raises:
         ValueError: A grid holds other values, such as probabilities or logits. Under `jax.jit` the
-            values of integers are not known: there, all but 0 is occupied.
+            values of integers are not known: every value other than 0 is occupied.
     """
     a, b = _occupied(predicted, "predicted"), _occupied(truth, "truth")
     intersection = jnp.sum(a & b, axis=AXES)
@@ -38,7 +38,7 @@ def iou(
 def _occupied(
     grid: Shaped[Array | np.ndarray, "..."], name: str
 ) -> Bool[Array | np.ndarray, "..."]:
-    """The voxels of a grid as booleans; `ValueError` where they are neither true nor false."""
+    """The voxels of a grid as booleans; raises `ValueError` for values other than 0 and 1."""
     if grid.dtype == bool:
         return grid
     if not jnp.issubdtype(grid.dtype, jnp.integer):

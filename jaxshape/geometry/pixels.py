@@ -15,7 +15,7 @@ from jaxshape.geometry.camera import Intrinsics
 from jaxshape.geometry.sensor import DEVIATION
 
 STEEPEST = 0.1
-"""Least cosine between a ray and the normal of the surface it meets."""
+"""Smallest accepted cosine between a ray and the normal of the surface that it hits."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,8 @@ class Sensor:
 
     Attributes:
         axial: Standard deviation of depth, in metres at 1 m; grows with the square of depth.
-        floor: Errors that do not grow with depth, in metres: of calibration and of poses.
+        floor: Standard deviation of errors that do not grow with depth, in metres: calibration and
+            poses.
 
     Raises:
         ValueError: A deviation is negative.
@@ -39,14 +40,14 @@ class Sensor:
 
 
 class SurfacePixels(NamedTuple):
-    """The planes that pixels show.
+    """The planes fitted to the surfaces in pixels.
 
     Attributes:
-        depth: Metres, averaged over the neighbours on the same surface; the nearest of the
-            neighbours where pixels make no surface. 0 where nothing is known, infinite where the
-            ray met nothing.
-        slope: Metres from the plane for each metre along the optical axis; 0 where the pixel makes
-            no surface.
+        depth: Depth in metres, averaged over the neighbours on the same surface; for pixels without
+            a surface, the depth of the nearest neighbour. 0 for missing depth, infinite where the
+            ray hit nothing.
+        slope: Metres from the plane for each metre along the optical axis; 0 for pixels without a
+            surface.
     """
 
     depth: Float[Array, "*n"]
@@ -61,12 +62,13 @@ def surface_pixels(
 ) -> SurfacePixels:
     """Fit a plane to each pixel's neighbourhood, and find the pixels that show no surface.
 
-    In inverse depth, planes are affine in pixel coordinates, so means and slopes of inverse depth
-    are exact for them.
+    The inverse depth of a plane is affine in pixel coordinates, so means and slopes of inverse
+    depth are exact for planes.
     """
     known = depth > 0
     inverse = jnp.where(known, 1 / jnp.where(known, depth, 1), -1.0)  # 0 where infinite
-    # Noise of inverse depth is the same at all depths; a slope of 80 degrees makes the rest.
+    # Noise of inverse depth is the same at all depths; the second term allows a slope of 80
+    # degrees.
     tolerance = 4 * sensor.axial + 5.7 * inverse / jnp.minimum(intrinsics.fx, intrinsics.fy)
     jump, total, count = jnp.zeros(depth.shape, bool), inverse, jnp.ones_like(depth)
     nearest = inverse
@@ -100,14 +102,14 @@ def surface_pixels(
 
 
 GREATEST = 2.0
-"""Slope in the corner of an image of 120 degrees; on the axis it is 1 at most."""
+"""Slope in the corner of an image of 120 degrees; on the optical axis it is at most 1."""
 
 SLOPE_BITS = 8
 """Bits of the slope, among the 32 of a pixel: depth keeps 15 bits of mantissa, 0.06 mm at 2 m."""
 
 
 def pack(pixels: SurfacePixels) -> UInt32[Array, "*n"]:
-    """Depth with the slope in its last bits, so that one look-up finds both."""
+    """Depth, with the slope in its last bits, so that one look-up reads both."""
     steps = 2**SLOPE_BITS - 1
     bits = lax.bitcast_convert_type(pixels.depth, jnp.uint32)
     slope = jnp.rint(jnp.minimum(pixels.slope / GREATEST, 1) * steps)

@@ -15,10 +15,10 @@ STEP = 2.8e-3
 """Step of the measured depth, in metres at 1 m."""
 
 DEVIATION = 1.6e-3
-"""Standard deviation of noise and quantisation together, in metres at 1 m: both, rounded."""
+"""Standard deviation of noise and quantisation together, in metres at 1 m, rounded."""
 
 SMALLEST_DEVIATION = 5e-4
-"""Standard deviation of the depth of near things, in metres."""
+"""Standard deviation of the depth of near surfaces, in metres."""
 
 UNEVENNESS = 5e-3
 """Largest distance of a floor or a wall from a plane, in metres."""
@@ -46,7 +46,7 @@ def tolerance(depth: Float[Array | np.ndarray, "*n"]) -> Float[Array | np.ndarra
         depth: Depths of the points `[*n]`, in metres.
 
     Returns:
-        Distances `[*n]`, in metres: nearly all of the sensor error, and the unevenness of a real
-        floor or wall.
+        Distances `[*n]`, in metres: they cover nearly all of the sensor error, and the unevenness
+        of a real floor or wall.
     """
     return UNEVENNESS + SPREAD * depth**2

@@ -1,4 +1,4 @@
-"""Each half of an object as evidence for the other, where the two measured halves agree."""
+"""Each half of an object as evidence for the other half, if the two measured halves agree."""
 
 from typing import NamedTuple
 
@@ -19,8 +19,8 @@ class Mirrored(NamedTuple):
     """Evidence from the mirror image of an object.
 
     Attributes:
-        logits: Nats to add to the logits of a decoded shape; 0 where the voxel itself was seen.
-        symmetric: Whether both sides agree where both were measured; logits are 0 where not.
+        logits: Nats to add to the logits of a decoded shape; 0 where the voxel itself was measured.
+        symmetric: Whether both sides agree where both were measured; if not, all logits are 0.
         agreement: The share of the surface measured on both sides that agrees; 1 without any.
     """
 
@@ -37,16 +37,16 @@ def mirror(x: Array | np.ndarray) -> Array:
 def mirrored(evidence: Evidence, nats: float = NATS) -> Mirrored:
     """Evidence about unknown voxels from their mirror images, where the object is symmetric.
 
-    A surface voxel that the grid places one voxel off still agrees. A surface contradicts symmetry
-    only where its mirror image and all voxels next to it were seen to be free.
+    A surface voxel that is off by one voxel because of the grid still agrees. A surface contradicts
+    symmetry only where its mirror image and all voxels next to it were seen to be free.
 
     Args:
         evidence: Probabilities of one object, in a frame whose x-axis points across the plane of
             symmetry.
-        nats: Nats that a mirror image seen with certainty adds.
+        nats: Nats that a mirror image adds if it was measured with certainty.
 
     Returns:
-        The nats, and how well the sides agree.
+        The nats, and the agreement of both sides.
     """
     surface, free = evidence
     axes = (-3, -2, -1)
