@@ -1,7 +1,7 @@
 """Searches of other packages, which run on the host and ask for points: pycma and nevergrad. [host]
 
-The names `pycma` and `nevergrad:NAME` stand for them in a benchmark. A function of your own that
-gives an `AskTell` enters as one that gives a `Refiner` does, by its import path.
+In a benchmark their names are `pycma` and `nevergrad:NAME`. Your own function that returns an
+`AskTell` enters by its import path, just like one that returns a `Refiner`.
 """
 
 import warnings
@@ -22,12 +22,12 @@ class Asker(Protocol):
         ...
 
     def tell(self, points: Float[np.ndarray, "n d"], losses: Float[np.ndarray, " n"]) -> str | None:
-        """Take the losses of these points, NaN where one failed; why it stops, if it does."""
+        """Take the losses of these points, NaN for failures; return a reason when it stops."""
         ...
 
 
 class AskTell(NamedTuple):
-    """A search on the host, for one point at a time.
+    """A search on the host, from one first point.
 
     Attributes:
         start: `(seed, point [d], loss) -> Asker`.
@@ -57,7 +57,7 @@ def pycma(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
     class Search:
         def __init__(self, seed, point, loss):
             del loss
-            # pycma takes the seed 0 for one from the clock.
+            # For the seed 0, pycma takes one from the clock.
             chosen = options | {"seed": 1 + seed}
             self.strategy = cma.CMAEvolutionStrategy(np.float64(point), config.sigma0, chosen)
 
@@ -73,14 +73,14 @@ def pycma(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
 
 
 def nevergrad(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
-    """An optimiser of nevergrad, which knows the whole budget from the start.
+    """An optimiser of nevergrad, which is told the whole budget at the start.
 
     Args:
-        variant: Name in nevergrad's registry, such as `TwoPointsDE`; None for `NGOpt`, its own
-            choice among all.
+        variant: Name in nevergrad's registry, such as `TwoPointsDE`; None for `NGOpt`, which
+            chooses an optimiser itself.
         dim: Dimension of a point.
-        config: Settings of the search: `population` candidates are asked for at a time,
-            `iterations` times; `sigma0` is the scale of a mutation, `bound` a box.
+        config: Settings of the search: it proposes `population` candidates in each of `iterations`
+            iterations; `sigma0` is the scale of a mutation, `bound` a box.
 
     Raises:
         ValueError: The package lacks this optimiser, or is not installed.
@@ -104,7 +104,7 @@ def nevergrad(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
 
         def ask(self):
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # on its own choice of settings
+                warnings.simplefilter("ignore")  # warnings on its own choice of settings
                 self.asked = [self.optimizer.ask() for _ in range(config.population)]
             return np.stack([one.value for one in self.asked])
 

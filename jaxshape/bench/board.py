@@ -89,7 +89,7 @@ def draw(path: Path, found: Sequence[Standing]) -> None:
 
 
 def _shares(axes: Any, reached: np.ndarray, end: float, **style: Any) -> None:
-    """The share of all targets that were reached, a step at each time that one was."""
+    """Plot the share of targets that were reached, with a step at each time of a reached target."""
     times = np.sort(reached[np.isfinite(reached)])
     shares = np.arange(1, len(times) + 1) / reached.size
     times, shares = np.append(times, max([end, *times[-1:]])), np.append(shares, [0, *shares][-1])
@@ -97,7 +97,7 @@ def _shares(axes: Any, reached: np.ndarray, end: float, **style: Any) -> None:
 
 
 def _end(found: Sequence[Standing]) -> float:
-    """The longest time at which any target was reached."""
+    """The latest time at which any target was reached."""
     times = np.concatenate([one.seconds.ravel() for one in found])
     return float(times[np.isfinite(times)].max(initial=SECONDS))
 

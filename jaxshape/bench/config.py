@@ -8,7 +8,8 @@ from jaxshape.search.config import Number, RefineConfig, Space
 
 KindName = Literal["clean", "noisy"]
 KINDS: tuple[KindName, ...] = get_args(KindName)
-"""Points of the paper's camera without noise, and signed distances of a Kinect's noisy frames."""
+"""Grids from points of the paper's camera without noise, and from signed distances of a Kinect's
+noisy frames."""
 
 FRAMES = (1, 4, 8)
 """Numbers of fused frames, the first of an orbit at 30 degrees elevation."""
@@ -23,14 +24,14 @@ LADDER = (0, *(2**k for k in range(3, 12)))
 """Numbers of decoder calls at which the best code so far is decoded."""
 
 LEFT = tuple(10 ** (-k / 10) for k in range(1, 21))
-"""Targets by objective: the share that is left of the gap between the objective of the first code
-and the lowest known one, from 0.79 to 0.01."""
+"""Targets by objective: remaining share of the gap between the objective of the first code and the
+lowest known objective, from 0.79 to 0.01."""
 
 GAINS = (0.01, 0.02, 0.04, 0.08, 0.16)
-"""Targets by IoU: the gain over the shape of the first code."""
+"""Targets by IoU: gains over the IoU of the first code."""
 
 AT_A_TIME = 8
-"""Problems searched together, by default: the rows that are scored together on a CPU."""
+"""Default number of problems searched together: as many as the rows that a CPU scores together."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class BenchConfig:
         space: Coordinates of the search: `whitened`, or `raw`, the codes themselves.
         bound: The search keeps every coordinate within this distance of the centre; above 0, in
             units of the search space. None for no bounds.
-        tolerance: The search stops where the objectives of recent candidates differ by less than
+        tolerance: The search stops when the objectives of recent candidates differ by less than
             this, 0 or more, in nats per voxel; 0 never stops it.
         budget: Decoder calls that each problem may spend, 8 to 2,048; a gradient counts as three.
         seed: Seed of the searches, 0 or more.
@@ -72,7 +73,7 @@ class BenchConfig:
         checks.whole("at_a_time", self.at_a_time, 1)
 
     def search(self) -> RefineConfig:
-        """The settings by which searches are built."""
+        """The settings with which searches are built."""
         iterations = max(1, self.budget // max(1, self.population))
         return RefineConfig(iterations=iterations, **self.of_search())
 
@@ -82,7 +83,7 @@ class BenchConfig:
         return {name: value for name, value in asdict(self).items() if name in own}
 
     def name_of(self, method: str) -> str:
-        """The name of an entry: the method, and the settings that are not the usual ones.
+        """The name of an entry: the method, and the settings that differ from the defaults.
 
         Args:
             method: Name of the search.

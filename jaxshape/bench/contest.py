@@ -1,4 +1,4 @@
-"""A method on a batch of problems, until the budget of each is spent. [host]"""
+"""Run a method on a batch of problems until the budget of each is spent. [host]"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -28,9 +28,9 @@ class Outcome(NamedTuple):
 
     Attributes:
         observer: The evaluations of the problems.
-        stops: By problem, why its search stopped: the name of a `StopReason`, or the search's own
-            reason.
-        compiling: Time that compiling took, in seconds; next to none but for the first problems.
+        stops: Why the search of each problem stopped: the name of a `StopReason`, or the search's
+            own reason.
+        compiling: Time that compilation took, in seconds; close to 0 except for the first problems.
     """
 
     observer: Observer
@@ -45,7 +45,7 @@ Contestant = Callable[[Sequence[Problem], int], Outcome]
 def contestant(
     method: str, example: Problem, config: RefineConfig, budget: int
 ) -> tuple[Contestant, bool]:
-    """A search by its name, ready to be run on problems.
+    """Build a search by its name, ready to be run on problems.
 
     Args:
         method: Name of a search (`jaxshape.search.names`), `pycma`, or `nevergrad:NAME`.
@@ -54,8 +54,8 @@ def contestant(
         budget: Decoder calls that each problem may spend.
 
     Returns:
-        The contestant, and whether it must be given one problem at a time: a search that evaluates
-        within a loop of its own.
+        The contestant, and whether it must be given one problem at a time because it evaluates the
+        objective within a loop of its own.
 
     Raises:
         ValueError: There is no such search, or it refuses its settings.
@@ -78,7 +78,7 @@ def contestant(
 
 
 def _must_be_alone(refiner: Refiner, field: "_Field", example: Problem) -> bool:
-    """Whether a step of the search evaluates within a loop or a branch, as line searches do."""
+    """Whether a step of the search evaluates points in a loop or branch, as line searches do."""
     objective = field.objectives(field.decoder, stacked_targets([example]))(jnp.int32(0))
     point, key = field.space.from_code(example.first_code), jax.random.key(0)
     state, _ = refiner.init(key, point, jnp.float32(1))
@@ -93,7 +93,7 @@ class _Field(NamedTuple):
     """The decoder and coordinates in which a method is run.
 
     Attributes:
-        decoder: The shape prior, which takes points of the search space for codes.
+        decoder: The shape prior, which takes points of the search space instead of codes.
         space: Coordinates of the search.
         observer: Counts the evaluations.
     """
@@ -103,7 +103,7 @@ class _Field(NamedTuple):
     observer: Observer
 
     def objectives(self, decoder: ShapePrior, targets: Target) -> Callable[..., Any]:
-        """The watched objectives of points, by the number of the problem."""
+        """The watched objective of each problem, by its number, as a function of points."""
         return watched(objectives(decoder, targets), self.observer, self.space.to_code)
 
     def start(self, problems: Sequence[Problem], seed: int) -> "_Start":
@@ -119,7 +119,7 @@ class _Field(NamedTuple):
 
 
 def _field(example: Problem, config: RefineConfig, budget: int) -> _Field:
-    """The decoder of a problem, in the coordinates that the settings name."""
+    """The decoder of a problem, in the coordinates that the settings select."""
     space, decoder = search_space(example.prior, config), example.decoder
 
     def decode(prepared, points):
@@ -130,7 +130,7 @@ def _field(example: Problem, config: RefineConfig, budget: int) -> _Field:
 
 
 class _Start(NamedTuple):
-    """Where the searches of some problems start.
+    """Starting points of the searches of some problems.
 
     Attributes:
         targets: Targets of the problems `[problem ...]`.
@@ -148,7 +148,7 @@ class _Start(NamedTuple):
 
 
 def _compiled(refiner: Refiner, field: _Field) -> Contestant:
-    """A `Refiner`: all problems take their step in one call of a compiled program."""
+    """Contestant of a `Refiner`: all problems make a step in one call of a compiled program."""
     observer, programs = field.observer, {}
 
     @jax.jit
@@ -174,7 +174,7 @@ def _compiled(refiner: Refiner, field: _Field) -> Contestant:
             programs[len(problems)] = move_all.lower(*shapes).compile()
         step, compiling = programs[len(problems)], time.perf_counter() - began
         observer.begin(at.codes, at.losses)
-        for number in range(1, observer.budget + 2):  # a search that evaluates nothing ends too
+        for number in range(1, observer.budget + 2):  # also ends a search that evaluates nothing
             more = jnp.int32(number), jnp.asarray(spent), keys, owners
             now = step(field.decoder, at.targets, *more, *now)
             jax.effects_barrier()
@@ -189,7 +189,7 @@ def _compiled(refiner: Refiner, field: _Field) -> Contestant:
 
 
 def _on_the_host(search: AskTell, field: _Field) -> Contestant:
-    """An `AskTell`: one search for each problem, all their points evaluated in one call."""
+    """Contestant of an `AskTell`: one search per problem, with all points evaluated in one call."""
     observer = field.observer
 
     @jax.jit
@@ -226,7 +226,7 @@ def _on_the_host(search: AskTell, field: _Field) -> Contestant:
 def _stacked(
     asked: Sequence[Float[np.ndarray, "n d"]], stops: Sequence[str | None]
 ) -> Float[np.ndarray, "problem m d"]:
-    """The points of all searches, padded by NaN; all NaN for searches that have stopped."""
+    """The points of all searches, padded with NaN; all NaN for searches that have stopped."""
     points = np.full((len(asked), max(map(len, asked)), asked[0].shape[1]), np.nan, np.float32)
     for i, (one, stop) in enumerate(zip(asked, stops, strict=True)):
         if stop is None:

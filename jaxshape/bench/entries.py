@@ -36,7 +36,7 @@ FORMAT = "jaxshape-bench-entry-1"
 PACKAGES = ("jaxshape", "jax", "jaxlib", "numpy", "optax", "evosax", "cma", "nevergrad")
 
 CLOSE = 1e-4
-"""Share by which an objective may differ from machine to machine."""
+"""Relative difference that is allowed between objectives from different machines."""
 
 
 class Entry(NamedTuple):
@@ -45,7 +45,7 @@ class Entry(NamedTuple):
     Attributes:
         about: The search and its problems: `format`, `set` and `sha256` of the problem set, `name`,
             `method`, `settings`, `budget` in decoder calls, `seed`.
-        machines: The machines that rows name, by a key.
+        machines: The machines that rows refer to, by key.
         rows: Results by problem.
     """
 
@@ -67,7 +67,7 @@ def new_entry(
     Args:
         name: Name of the method on the board.
         method: Name by which the search can be built; None for a loop of your own.
-        settings: Everything that a reader needs to repeat the search, as JSON can hold it.
+        settings: Everything that a reader needs to repeat the search, in types of JSON.
         budget: Decoder calls that each problem could spend.
         seed: Seed of the searches.
     """
@@ -85,7 +85,7 @@ def new_entry(
 
 
 def with_rows(entry: Entry, rows: dict[str, Row]) -> Entry:
-    """The entry with rows that this machine has just made.
+    """Add rows that this machine has just made to an entry.
 
     Args:
         entry: The entry so far.
@@ -116,7 +116,7 @@ def read_entry(path: Path) -> Entry:
         path: The file.
 
     Raises:
-        ValueError: The file is no entry.
+        ValueError: The file is not an entry.
     """
     try:
         content = reading.read_json(path)
@@ -130,15 +130,14 @@ def read_entry(path: Path) -> Entry:
 
 
 def read_entries(paths: Iterable[Path]) -> list[Entry]:
-    """Read entries, and merge the parts of each; parts of one name must agree in everything but
-    rows.
+    """Read entries, and merge parts of the same name; parts must agree in everything except rows.
 
     Args:
         paths: The files.
 
     Raises:
-        ValueError: A file is no entry, or two files of one name differ in the search, its budget or
-            its seed.
+        ValueError: A file is not an entry, or two files of one name differ in the search, its
+            budget or its seed.
     """
     found: dict[str, Entry] = {}
     for path in sorted(paths):
@@ -196,7 +195,7 @@ def faults(entry: Entry, problems: Sequence[Problem]) -> list[str]:
 def _fault(row: Row, problem: Problem, budget: int) -> str | None:
     """The fault of a row; None for a valid row."""
     objective, ious = np.array(row["objective"], float), np.array(row["iou"], float)
-    # A row without any target reached has pairs too, none.
+    # The reshape also gives zero pairs for a row that reached no target.
     reached, goals = np.array(row["reached"], float).reshape(-1, 2), np.array(targets(problem))
     if objective.shape != (len(LADDER),) or ious.shape != (len(LADDER),):
         return f"objectives and IoU are not given at the {len(LADDER)} numbers of decoder calls"

@@ -1,4 +1,4 @@
-"""The machine that results were made on, as a reader needs it to compare figures. [host]"""
+"""Description of the machine that made the results, so that readers can compare figures. [host]"""
 
 import os
 import platform
@@ -15,7 +15,8 @@ def describe_machine(packages: Iterable[str]) -> dict[str, Any]:
     """Processor, device and versions.
 
     Args:
-        packages: Names of the packages whose versions count; None stands for one that is missing.
+        packages: Names of the packages whose versions are reported; None is reported for one that
+            is missing.
     """
     model, features = processor()
     return {
@@ -30,7 +31,7 @@ def describe_machine(packages: Iterable[str]) -> dict[str, Any]:
 
 
 def load() -> float | None:
-    """Processes that wanted to run during the last minute, over the cores; None if not known."""
+    """Load of the last minute: runnable processes for each core; None if not known."""
     return round(os.getloadavg()[0] / _cores(), 2) if hasattr(os, "getloadavg") else None
 
 

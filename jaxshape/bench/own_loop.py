@@ -1,4 +1,4 @@
-"""Your own loop over problems, watched, so that its result can stand on the board. [host]"""
+"""Watch your own loop over problems, so that its result can appear on the board. [host]"""
 
 import os
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from jaxshape.search.residuals import Target
 
 @dataclass(frozen=True)
 class Watch:
-    """The objectives of problems, with a count of who asks for them, and when.
+    """The objectives of problems; every evaluation is counted, with its time.
 
     Attributes:
         problems: The problems, one or more.
@@ -43,7 +43,7 @@ class Watch:
         checks.whole("budget", self.budget, LADDER[1])
         checks.within("budget", self.budget, LADDER[1], LADDER[-1])
         self.begin()
-        _ = self._watched  # its arrays are made now, before anything is traced
+        _ = self._watched  # makes its arrays now, before anything is traced
 
     @cached_property
     def _observer(self) -> Observer:
@@ -65,22 +65,22 @@ class Watch:
     def objective(
         self, code: Float[Array, " d"], number: Int[Array, ""] | int = 0
     ) -> Float[Array, ""]:
-        """The objective of a problem, in nats per voxel; each code that it is given is counted.
+        """The objective of a problem, in nats per voxel; each evaluated code is counted.
 
         Use it under `jax.jit`, `jax.vmap` and `jax.grad`, in any loop.
 
         Args:
             code: A code `[d]`.
-            number: Number of the problem; it may be traced, so that one program serves all.
+            number: Index of the problem; it may be traced, so that one program serves all problems.
         """
         return self._watched(jnp.asarray(number, jnp.int32))(code)
 
     def begin(self, number: int | None = None) -> None:
-        """Start the clock and count from 0; everything before was compilation.
+        """Restart the clock and the count at 0, so that compilation does not count.
 
         Args:
-            number: Number of the problem that is searched from now on, by itself; None where all
-                are searched together, which then share the time evenly.
+            number: Index of the one problem that is searched from now on; None if all are searched
+                together, and then they share the time evenly.
         """
         jax.effects_barrier()
         if number is None:
@@ -121,7 +121,7 @@ def enter_benchmark(
 ) -> Path:
     """Write the results of your own loop where `jaxshape bench` finds them. [host]
 
-    Results of other problems that the file holds already are kept.
+    Results of other problems that are already in the file are kept.
 
     Args:
         folder: Folder of the board.

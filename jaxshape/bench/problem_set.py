@@ -1,9 +1,9 @@
 """The frozen problems: measurements of chairs and seats, and their true surfaces. [host]
 
-A set is two files of one name. The `.npz` file holds the grids, packed as in a dataset. The `.json`
-file holds the objects with their makers, the fingerprint of the weights, and the lowest known
-objective of each problem. experiments/bench_set.py made both. A set never changes; another one gets
-another name.
+A set is two files with the same stem. The `.npz` file holds the grids, packed as in a dataset. The
+`.json` file holds the objects with their makers, the fingerprint of the weights, and the lowest
+known objective of each problem. experiments/bench_set.py made both. A set never changes; a new set
+gets a new name.
 """
 
 import hashlib
@@ -29,11 +29,11 @@ class ProblemSet(NamedTuple):
     Attributes:
         name: Name of the set, with its version.
         objects: Name and source of each object.
-        measured: By kind, F and M of each object and number of frames `[object number voxels]`, as
-            `pack_measured` packs them.
-        surfaces: True surface voxels of each object `[object bytes]`, as `pack` packs them.
+        measured: F and M of each object and number of frames `[object number voxels]`, by kind,
+            packed by `pack_measured`.
+        surfaces: True surface voxels of each object `[object bytes]`, packed by `pack`.
         weights: Fingerprint of the weights whose codes are searched.
-        best: By problem, the lowest objective known, in nats per voxel.
+        best: The lowest known objective of each problem, in nats per voxel.
     """
 
     name: str
@@ -44,7 +44,7 @@ class ProblemSet(NamedTuple):
     best: dict[str, float]
 
     def keys(self) -> list[tuple[str, int, int, str]]:
-        """Name, object, place among the numbers of frames, and kind of every problem."""
+        """Name, object, index in `FRAMES`, and kind of every problem."""
         every = product(range(len(self.objects)), enumerate(FRAMES), KINDS)
         return [
             (f"{self.objects[o]['name']}/{k}/{kind}", o, place, kind)

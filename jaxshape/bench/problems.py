@@ -27,12 +27,12 @@ RESIDUALS = {"clean": BALANCED, "noisy": SOFT}
 """The default objective of each kind of grids."""
 
 EQUATION_7 = Residual(BALANCED.target, cross_entropy)
-"""Scores the targets of both residuals."""
+"""Residual that scores the targets of both kinds."""
 
 
 BOX = 10.0
-"""Half side of the box of a problem, in standard deviations of the codes; found codes stay within
-7."""
+"""Half side of the box of a problem, in standard deviations of the codes; codes found by searches
+stay within 7."""
 
 
 class Problem(NamedTuple):
@@ -80,7 +80,7 @@ class Problem(NamedTuple):
 
     @property
     def bounds(self) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
-        """Lowest and highest numbers of a box of codes, for searches that need one; no rule."""
+        """Lower and upper corner of a box of codes, for searches that need bounds; not enforced."""
         half = BOX * jnp.sqrt(jnp.diag(self.prior.code_covariance))
         return self.prior.code_mean - half, self.prior.code_mean + half
 
@@ -93,7 +93,7 @@ def stacked_targets(problems: Sequence[Problem]) -> Target:
 def objectives(
     decoder: ShapePrior, targets: Target
 ) -> Callable[[Int[Array, ""]], Callable[[Float[Array, " d"]], Float[Array, ""]]]:
-    """The objective of each of some problems, by its number.
+    """The objectives of problems, by index.
 
     Args:
         decoder: The shape prior, its parameters prepared.
@@ -113,8 +113,8 @@ def problems(
     """The problems of the benchmark, or some of them. [host]
 
     Args:
-        objects: Number of objects, from the first of the set; None for all. Two of three are
-            procedural chairs, the third is a CAD seat.
+        objects: Number of objects, starting with the first of the set; None for all. Two of three
+            are procedural chairs, the third is a CAD seat.
         frames: Numbers of fused frames, among 1, 4 and 8.
         kinds: `clean` for points of the paper's camera without noise, `noisy` for signed distances
             of a Kinect's noisy frames.

@@ -1,4 +1,4 @@
-"""Methods on all problems, a batch at a time; a killed run loses one batch at most. [host]"""
+"""Run methods on all problems, a batch at a time; a killed run loses at most one batch. [host]"""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -43,18 +43,18 @@ def run(
 ) -> Iterator[BenchProgress]:
     """Run methods on problems, and write an entry for each.
 
-    Problems of which any part in the folder holds results are not searched again.
+    Problems with results in any part in the folder are not searched again.
 
     Args:
         methods: Names of the searches.
         problems: The problems.
         config: Settings of the searches.
         folder: Folder of the entries.
-        part: The part of the problems that these are, `i/n`, for the names of the files; empty for
+        part: Which part of all problems these are, `i/n`, for the names of the files; empty for
             all.
 
     Yields:
-        The progress, for each method at first and after each batch.
+        The progress, for each method at its start and after each batch.
 
     Raises:
         ValueError: The method is unknown, or the folder holds results of the same method with other
@@ -79,7 +79,7 @@ def run(
         size = 1 if alone else min(config.at_a_time, max(1, len(left)))
         for start in range(0, len(left), size):
             batch = left[start : start + size]
-            filled = [batch[i % len(batch)] for i in range(size)]  # one compiled program for all
+            filled = [batch[i % len(batch)] for i in range(size)]  # one size, one compiled program
             entry = with_rows(entry, _searched(search, filled, config))
             write_entry(path, entry)
             done |= {one.name for one in batch}
@@ -95,7 +95,7 @@ def _searched(search: Contestant, batch: Sequence[Problem], config: BenchConfig)
 
 
 def _rows_in(folder: Path, entry: Entry) -> set[str]:
-    """Problems of which a folder has results, in all parts of an entry."""
+    """Problems for which a folder has results, in all parts of an entry."""
     name = entry.about["name"]
     found = [x for x in read_entries(folder.glob("*.json")) if x.about["name"] == name]
     if found and found[0].about != entry.about:

@@ -1,4 +1,4 @@
-"""The figures of the search of a problem: when it reached each target, and its shapes. [host]"""
+"""Figures of the search of a problem: when it reached each target, and its best codes. [host]"""
 
 import base64
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from jaxshape.model.shapes import decode
 Row = dict[str, Any]
 """The figures of one problem: `calls` and `seconds` spent, `stop`; at each step of `LADDER` the
 `objective` and `iou` of the best code so far; `reached`, calls and seconds at each target by
-objective, in order, as far as they were reached; `code`, the last of these codes."""
+objective that was reached, in order; `code`, the last best code."""
 
 
 def rows_of(
@@ -29,7 +29,7 @@ def rows_of(
     Args:
         problems: The problems.
         observer: The evaluations of the problems.
-        stops: Why each search stopped, in a word.
+        stops: Why each search stopped, as one word.
     """
     ladders = [[_best_within(found, rung) for rung in LADDER] for found in observer.improvements]
     codes = jnp.stack([jnp.stack([best.code for best in ladder]) for ladder in ladders])
@@ -53,18 +53,18 @@ def rows_of(
 
 
 def targets(problem: Problem) -> list[float]:
-    """The objectives to reach, from near the first code's to near the lowest known."""
+    """The objectives to reach, from near that of the first code to near the lowest known."""
     first, best = float(problem.first_objective), problem.best_objective
     return [best + left * (first - best) for left in LEFT]
 
 
 def _best_within(found: Sequence[Improvement], calls: int) -> Improvement:
-    """The best code within so many decoder calls."""
+    """The best code within a number of decoder calls."""
     return [one for one in found if one.calls <= calls][-1]
 
 
 def _first_below(found: Sequence[Improvement], goals: Sequence[float]) -> list[Improvement]:
-    """The first code that reached each goal, as far as goals were reached."""
+    """The first code that reached each goal, for the goals that were reached."""
     first = [next((one for one in found if one.loss <= goal), None) for goal in goals]
     return [one for one in first if one is not None]
 

@@ -1,4 +1,4 @@
-"""Entries against each other: shares of targets reached, and the table of a board. [host]"""
+"""Comparison of entries: shares of targets reached, and the table of a board. [host]"""
 
 import re
 from collections import Counter
@@ -13,7 +13,7 @@ from jaxshape.bench.entries import Entry
 from jaxshape.bench.scoring import Row
 
 NEAR = next(i for i, left in enumerate(LEFT) if left < 0.0502)
-"""The target that leaves a twentieth of the gap."""
+"""Index of the target that leaves a twentieth of the gap."""
 
 
 class Standing(NamedTuple):
@@ -22,11 +22,12 @@ class Standing(NamedTuple):
     Attributes:
         entry: The entry, with these problems alone.
         calls: Decoder calls at which each target by objective was reached `[problem target]`; +inf
-            where it was not.
-        seconds: Seconds at which each target was reached `[problem target]`; +inf where it was not.
-        gap: Share of the gap between the first and the lowest known objective that is left, at each
-            rung of the ladder `[problem rung]`.
-        iou: IoU of the best code so far at each rung `[problem rung]`.
+            if it was not reached.
+        seconds: Seconds at which each target was reached `[problem target]`; +inf if it was not
+            reached.
+        gap: Remaining share of the gap between the first and the lowest known objective, at each
+            step of `LADDER` `[problem rung]`.
+        iou: IoU of the best code so far, at each step of `LADDER` `[problem rung]`.
     """
 
     entry: Entry
@@ -42,7 +43,7 @@ class Standing(NamedTuple):
 
     @property
     def budget(self) -> int:
-        """Decoder calls that its searches could spend on a problem."""
+        """Decoder calls that the entry's searches could spend on each problem."""
         return self.entry.about["budget"]
 
     def share(self, calls: int | float = np.inf, seconds: int | float = np.inf) -> float:
@@ -69,23 +70,23 @@ class Standing(NamedTuple):
         """Mean share of the targets reached, over the logarithm of decoder calls.
 
         Args:
-            calls: The budget up to which it is taken.
+            calls: Largest number of decoder calls to include.
         """
         return float(np.mean([self.share(rung) for rung in LADDER[1:] if rung <= calls]))
 
 
 def shared_problems(entries: Sequence[Entry]) -> list[str]:
-    """The problems of which all entries have results."""
+    """The problems for which all entries have results."""
     names = set.intersection(*(set(entry.rows) for entry in entries)) if entries else set()
     return [name for name in entries[0].rows if name in names] if entries else []
 
 
 def standings(entries: Sequence[Entry], best: dict[str, float]) -> list[Standing]:
-    """Entries on the problems that all of them have, the best within the least budget first.
+    """Compare entries on their common problems; the best within the smallest budget comes first.
 
     Args:
         entries: The entries.
-        best: By problem, the lowest objective known.
+        best: The lowest known objective of each problem.
 
     Raises:
         ValueError: No problem is common to all.
@@ -189,7 +190,7 @@ def markdown(found: Sequence[Standing]) -> str:
 
 
 def conditions(found: Sequence[Standing]) -> list[str]:
-    """Sentences on where the results were made, and how much the seconds are worth."""
+    """Sentences on the machines that made the results, and on the reliability of the seconds."""
     machines = {k: machine for one in found for k, machine in one.entry.machines.items()}
     rows = [row for one in found for row in one.entry.rows.values()]
     loads = [row["load"] for row in rows if row.get("load") is not None]

@@ -1,9 +1,9 @@
-"""Every evaluation of a search, counted by the problem and not by the search. [host]
+"""Count every evaluation of a search on the side of the problem, not of the search. [host]
 
 A watched objective is the objective itself with one side effect: each evaluation, in a compiled
 loop or outside, reports its codes and losses to the observer. A search can thus neither forget an
 evaluation nor count one twice, and its own count does not matter. A candidate is one decoder call.
-A gradient, a pass forward and one back, takes the time of three and counts as three.
+A gradient needs a forward and a backward pass, takes the time of three calls and counts as three.
 """
 
 import time
@@ -20,11 +20,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxshape.search.curvature import Composed
 
 GRADIENT = 3
-"""Decoder calls that a value with its gradient counts as."""
+"""Number of decoder calls that one value with its gradient costs."""
 
 
 class Improvement(NamedTuple):
-    """A code that was better than all before it.
+    """A code that was better than all earlier ones.
 
     Attributes:
         calls: Decoder calls spent up to it, itself included; 0 for the first code.
@@ -40,16 +40,16 @@ class Improvement(NamedTuple):
 
 
 class Observer:
-    """The evaluations of some problems by a search, each within the same budget.
+    """The evaluations of some problems by a search; each problem has the same budget.
 
-    Evaluations after the budget is spent do not count; neither does a gradient that only begins
-    within it.
+    Evaluations after the budget is spent do not count. An improvement does not count, either, if
+    its gradient only begins within the budget.
 
     Attributes:
         budget: Decoder calls that each problem may spend.
         calls: Decoder calls spent on each problem.
-        seconds: Time at which the last evaluation of each problem came in, since it began.
-        improvements: By problem, the codes that were better than all before them.
+        seconds: Time from the start of each problem to its last evaluation, in seconds.
+        improvements: The codes of each problem that were better than all earlier ones.
     """
 
     def __init__(self, budget: int) -> None:
@@ -64,7 +64,7 @@ class Observer:
         codes: Float[Array | np.ndarray, "problem d"],
         losses: Float[Array | np.ndarray, " problem"],
     ) -> None:
-        """Start counting problems that are searched together; compiling should be over.
+        """Start counting for problems that are searched together, after compilation.
 
         Args:
             codes: First codes of the problems `[problem d]`, which cost nothing.
@@ -74,11 +74,11 @@ class Observer:
         starts = zip(np.asarray(codes), np.asarray(losses).tolist(), strict=True)
         self.calls, self.seconds = [0] * count, [0.0] * count
         self.improvements = [[Improvement(0, 0.0, loss, code)] for code, loss in starts]
-        # Problems share the time that passes evenly.
+        # All problems share the elapsed time evenly.
         self._clocks = [(time.perf_counter(), 1 / count)] * count
 
     def begin_alone(self, problem: int) -> None:
-        """Start counting one of these problems from 0; it is searched by itself from now on.
+        """Restart the count of one of these problems at 0; from now on it is searched alone.
 
         Args:
             problem: Number of the problem.
@@ -89,14 +89,14 @@ class Observer:
 
     @property
     def spent(self) -> Bool[np.ndarray, " problem"]:
-        """Whether the budget of each problem is spent, as far as evaluations have come in."""
+        """Whether the budget of each problem is spent, by the evaluations received so far."""
         return np.array(self.calls) >= self.budget
 
     def note(self, cost: int, owner: Any, codes: Any, losses: Any) -> None:
         """Count some evaluations; codes that are not finite were not decoded and cost nothing.
 
         Args:
-            cost: Decoder calls of each.
+            cost: Decoder calls that each evaluation costs.
             owner: The problem of each code `[n]`.
             codes: The codes `[n d]`.
             losses: Their objectives `[n]`.
@@ -122,13 +122,13 @@ def watched(
     observer: Observer,
     to_code: Callable[[Float[Array, " d"]], Float[Array, " d"]] = lambda point: point,
 ) -> Callable[[Int[Array, ""]], Any]:
-    """The objectives of some problems, watched.
+    """Make the objectives of some problems report to an observer.
 
     Args:
         objective_of: The objective of a problem, by its number. A `Composed` objective stays
             `Composed`, so that a search can expand it to second order.
-        observer: Learns of every evaluation.
-        to_code: The code of a point that the objectives take.
+        observer: The observer that counts every evaluation.
+        to_code: Maps a point, which the objectives take, to its code.
 
     Returns:
         The watched objective of a problem, by its number, to be used under any `jax.vmap`s and
@@ -155,7 +155,7 @@ def watched(
             return loss_of(point, owner)
 
         def expansion(point, directions):
-            """A product with the matrix takes the time of a gradient."""
+            """Count each product with the matrix as a gradient, which takes the same time."""
             found = objective.expansion(point, directions)
             cost = GRADIENT * (1 + len(found.directions))
             return found._replace(loss=reported(cost, owner, point, found.loss))
@@ -166,7 +166,7 @@ def watched(
 
 
 def _telling(observer: Observer, cost: int) -> Callable[..., Float[Array, ""]]:
-    """`(owner, code, loss) -> loss`, which tells the observer; a batch tells it all at once."""
+    """`(owner, code, loss) -> loss`, which reports to the observer; a batch reports in one call."""
 
     @custom_vmap
     def rows(owner, codes, losses):
@@ -186,20 +186,20 @@ def _telling(observer: Observer, cost: int) -> Callable[..., Float[Array, ""]]:
 
 
 def evaluates_in_a_branch(step: Callable[..., Any], *examples: Any) -> bool:
-    """Whether a step evaluates a watched objective within a loop or a branch of unknown length.
+    """Whether a step evaluates a watched objective in a branch or in a loop of unknown length.
 
     In a batch, such a loop runs until the last problem has finished, and every branch is taken:
     each problem would pay for the others.
 
     Args:
         step: One step of one problem.
-        examples: Arguments of the shapes that it takes.
+        examples: Example arguments of the step, for their shapes.
     """
     return any(_has_effects(jax.make_jaxpr(step)(*examples).jaxpr))
 
 
 def _has_effects(program: Any):
-    """For all loops and branches of a program, whether they hold side effects."""
+    """For each loop and branch of a program, whether it contains side effects."""
     for equation in program.eqns:
         if equation.primitive.name in ("while", "cond"):
             yield bool(equation.effects)
