@@ -3,7 +3,7 @@
 Each subcommand is a frozen dataclass: its fields are its options, its docstring is its help, and
 its `run` does the work. Bad input ends with one sentence on standard error and exit status 2, and
 leaves earlier output as it was. JAX, and every module that needs it, is imported inside `run`, so
-that `--help` answers at once.
+that `--help` starts quickly.
 
     rebuild    demo
     recording  reconstruct
@@ -75,9 +75,9 @@ def commands(arguments: Sequence[str]) -> Any:
 
 def main() -> None:
     """Run the command line; the entry point of the console script."""
-    sys.path.append("")  # the current folder may hold a search of the user's own
+    sys.path.append("")  # the current folder may hold the user's own search
     warnings.showwarning = lambda message, *_, **__: warn(str(message))
-    for stream in (sys.stdout, sys.stderr):  # names of files may be in no encoding
+    for stream in (sys.stdout, sys.stderr):  # file names may have characters outside the encoding
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     if sys.argv[1:] == ["--version"]:
@@ -96,7 +96,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except (RefusedSetting, ValueError, OSError, MemoryError) as problem:
-        # By the convention of the package these are sentences for the user; other errors are bugs.
+        # By convention of the package these carry sentences for the user; other errors are bugs.
         console.print(f"[red]jaxshape:[/] {escape(_sentence(problem, output))}", soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt as stop:
@@ -106,7 +106,7 @@ def main() -> None:
 
 
 def _sentence(problem: Exception, output: Output | None) -> str:
-    """The error, and the files that are left."""
+    """The error as a sentence, with the files that are left."""
     if isinstance(problem, MemoryError):
         return "The memory of this machine does not suffice."
     if isinstance(problem, OutputError):

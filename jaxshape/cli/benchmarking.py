@@ -1,4 +1,4 @@
-"""`jaxshape bench`: searches against each other on a frozen set of problems, and their board."""
+"""`jaxshape bench`: compare searches on a frozen set of problems, and draw their board."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,26 +28,26 @@ class Bench:
 
     methods: str = "cma,gradient:adam"
     """Searches, separated by commas: the names that `jaxshape reconstruct --method` takes, pycma,
-    nevergrad:NAME, or MODULE:FUNCTION of your own. Empty to draw the board and run nothing."""
+    nevergrad:NAME, or your own MODULE:FUNCTION. Empty to draw the board and run nothing."""
     output: Path = Path("board")
-    """Folder for a file of each method, and for board.md, board.png and board.html. Results that
-    are there already are kept, and not searched for again."""
+    """Folder for one file for each method, and for board.md, board.png and board.html. Existing
+    results are kept, and not computed again."""
     objects: int = 24
-    """The first so many objects of the set."""
+    """Number of objects, starting with the first of the set."""
     frames: str = ",".join(map(str, FRAMES))
     """Numbers of fused frames, separated by commas, among 1, 4 and 8."""
     kinds: tuple[KindName, ...] = KINDS
-    """Without noise, and with a Kinect's."""
+    """Depth without noise (clean), and with a Kinect's noise (noisy)."""
     part: str = "1/1"
-    """Only a part of the problems, I/N, for one of N machines; put the files of all parts into one
-    folder."""
+    """Run only part I of N of the problems, for one of N machines; put the files of all parts into
+    one folder."""
     search: tyro.conf.OmitArgPrefixes[BenchConfig] = BenchConfig()
     check: bool = False
-    """Run nothing; validate the results in the folder, computing objectives again."""
+    """Run no searches; validate the results in the folder by computing their objectives again."""
 
     @property
     def writes(self) -> Output | None:
-        """The folder that is written; the parts of a board may be made at the same time."""
+        """The output folder; the parts of a board may be made at the same time."""
         if self.check:
             return None
         i, n = _part(self.part)
@@ -86,7 +86,7 @@ class Bench:
 
 
 def _part(text: str) -> tuple[int, int]:
-    """The part I of N."""
+    """I and N of the option I/N."""
     numbers = text.split("/")
     right = len(numbers) == 2 and all(x.isdecimal() for x in numbers)
     i, n = map(int, numbers) if right else (0, 0)
@@ -117,7 +117,7 @@ def _board(folder: Path, found: Any, problem_set: Any) -> None:
     write_board(folder, found, problem_set)
     shown = Table(title=f"{len(found[0].calls)} problems", box=None, padding=(0, 1, 0, 0))
     kept = [i for i, column in enumerate(COLUMNS) if column not in ("IoU targets", "stopped by")]
-    for i in kept:  # 80 columns hold them
+    for i in kept:  # these fit into 80 columns
         header = headings("\n")[i]
         shown.add_column(header, justify="right" if i else "left", no_wrap=True)
     for row in table(found):

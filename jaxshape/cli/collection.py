@@ -16,7 +16,7 @@ from jaxshape.cli.common import (
 from jaxshape.cli.options import Axes
 
 SAMPLE = 200
-"""Number of meshes that are checked where a sample suffices."""
+"""Number of meshes that are checked if a sample suffices."""
 
 VOTERS = 12
 """Meshes that vote on the axes: each takes about a second."""
@@ -54,8 +54,7 @@ def look_at(sources: Sequence[Any], axes: Axes, workers: int | None = None) -> l
 def load_models(
     sources: Sequence[Any], axes: Axes, *, refuse: bool = True
 ) -> tuple[list[Any], list[Any]]:
-    """The usable meshes (`Model`) and the `Skipped` ones; it may refuse a folder without usable
-    ones."""
+    """The usable meshes (`Model`) and the `Skipped` ones; `refuse` raises if none is usable."""
     from jaxshape.data.dataset import load_object
     from jaxshape.data.meshes import Skipped
     from jaxshape.data.survey import doubted_size
@@ -86,7 +85,7 @@ def load_models(
 
 
 def turned(sources: Sequence[Any], axes: Axes, prior: Any = None) -> list[Any]:
-    """The meshes, each with the axes that it seems to have, where --axes auto asks for that."""
+    """The meshes; with --axes auto, each with the axes that were estimated for it."""
     if axes.axes == "given":
         return list(sources)
     from jaxshape.model.facing import dissenting, usual_axes
@@ -110,10 +109,10 @@ def check_axes(
     prior: Any = None,
     refuse: bool = False,
 ) -> None:
-    """Warn where the axes of a collection seem wrong, or differ within it.
+    """Warn if the axes of a collection seem wrong, or differ between its meshes.
 
-    `lying` names the meshes that seem to lie on their side. Collections whose meshes mostly do are
-    refused if they are certainly seats.
+    `lying` holds the names of meshes that seem to lie on their side. If most meshes do and they are
+    certainly seats, the collection can be refused.
     """
     from jaxshape.data.survey import evenly
     from jaxshape.model.facing import dissenting, usual_axes
@@ -123,7 +122,7 @@ def check_axes(
     given, count = (axes.up, axes.front), len(sources)
     if 2 * len(lying) > count:
         scores = _scores(evenly(sources, VOTERS), axes, prior)
-        if not scores and not refuse:  # these are no seats
+        if not scores and not refuse:  # these are not seats
             return
         standing = usual_axes(scores, ("z", "-y"))
         complaint = (
@@ -160,8 +159,8 @@ def _flags(pair: tuple[str, str]) -> str:
 def _scores(
     sources: Sequence[Any], axes: Axes, prior: Any, ups: tuple[str, ...] | None = None
 ) -> dict[str, Any]:
-    """The fit of each pair of axes of the files to each mesh; empty where nothing is known of their
-    kind: `prior` knows its own, the weights for chairs know seats."""
+    """Scores of each pair of axes for each mesh; empty if no prior knows this kind of object.
+    `prior` knows its own kind, and the weights for chairs know seats."""
     from jaxshape.data.meshes import Skipped, load, resembles_a_seat
     from jaxshape.model.facing import are_known, facing_scores
     from jaxshape.model.weights import load_prior

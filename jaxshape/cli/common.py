@@ -1,4 +1,4 @@
-"""Parts that all commands share: the console, progress, and the refusal of bad input."""
+"""Parts that all commands share: the console, progress bars, and the refusal of bad input."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 console = Console(stderr=True)
-"""Progress, warnings and errors; the answer of a command goes to standard output."""
+"""Console for progress, warnings and errors; the results of a command go to standard output."""
 
 
 class BadInput(ValueError):
@@ -26,7 +26,7 @@ def warn(sentence: str) -> None:
 
 
 def progress_bar(unit: str) -> Progress:
-    """A bar with counts, the time left, and a free text."""
+    """A progress bar with counts, the time left, and a note."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -39,7 +39,7 @@ def progress_bar(unit: str) -> Progress:
 
 
 NAMED = 3
-"""Meshes that are named for each reason."""
+"""Number of meshes that are named for each reason."""
 
 
 def report_skipped(skipped: Iterable[Any]) -> None:
@@ -52,7 +52,7 @@ def report_skipped(skipped: Iterable[Any]) -> None:
 
 
 def report_notes(notes: Iterable[tuple[str, str]]) -> None:
-    """Print notes on parts of files that are not the object: names of meshes, and `Model.notes`."""
+    """Print notes on parts of files that are not the object, from pairs of mesh name and note."""
     kinds: dict[str, list[tuple[str, str]]] = {}
     for name, note in notes:
         kinds.setdefault(note.partition(" left out")[0], []).append((name, note))

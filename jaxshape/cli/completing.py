@@ -18,9 +18,9 @@ from jaxshape.data.config import Axis
 class Complete(Rebuild):
     """Complete a point cloud or a fused model of a single object.
 
-    The prior finds the axes of the file that point up and to the front. Free space is known along
-    rays from --sensor to the points, or, less of it, from normals in the file; without both, every
-    unmeasured voxel is predicted.
+    The prior finds which axes of the file point up and to the front. Free space is known along rays
+    from --sensor to the points or, to a lesser extent, from normals in the file; without both,
+    every unmeasured voxel is predicted.
 
     Examples: jaxshape complete scan.ply
 
@@ -28,21 +28,21 @@ class Complete(Rebuild):
     """
 
     scan: Positional[Path]
-    """A .ply file of points, with normals or without, or of triangles; or a .pcd file."""
+    """A .ply file of points (with or without normals) or of triangles, or a .pcd file."""
     up: Axis | None = None
-    """Axis of the file that points up; found by default."""
+    """Axis of the file that points up; estimated by default."""
     front: Axis | None = None
-    """Axis of the file along which the object's front looks; found by default."""
+    """Axis of the file towards which the object faces; estimated by default."""
     sensor: tuple[float, float, float] | None = None
-    """Where the sensor was, in the frame and the unit of the file, if it saw all from there; a .pcd
-    file may say it by itself."""
+    """Position of the sensor, in the frame and unit of the file, if all points were measured from
+    one position; a .pcd file may contain it."""
     output: Path = Path("out/complete")
     """Folder for mesh.glb (in metres), mesh.ply (in the frame and the unit of the file), grid.npz,
     result.json, overview.png and report.html."""
 
     @property
     def writes(self) -> Output:
-        """The folder that is written."""
+        """The output folder."""
         return Output(self.output)
 
     def run(self) -> None:

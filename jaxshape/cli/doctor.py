@@ -19,7 +19,7 @@ PACKAGES = (
     "jaxshape", "jax", "jaxlib", "flax", "optax", "evosax", "numpy", "scipy", "trimesh", "embreex",
     "scikit-image", "pillow", "viser", "OpenEXR",
 )  # fmt: skip
-"""Packages whose versions matter; the last two and embreex are optional."""
+"""Packages whose versions are printed; the last two and embreex are optional."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Doctor:
 
 
 def findings() -> dict[str, Any]:
-    """Everything that `jaxshape doctor` prints, as JSON can hold it."""
+    """Everything that `jaxshape doctor` prints, in types of JSON."""
     import jax
 
     from jaxshape.model.weights import PACKAGED, load_prior

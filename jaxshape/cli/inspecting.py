@@ -45,7 +45,7 @@ ConventionName = Literal[
 
 @dataclass(frozen=True)
 class Inspect:
-    """Describe a recording, and warn of possible faults, each with the evidence and a remedy.
+    """Describe a recording, and warn of possible faults, with evidence and a remedy for each.
 
     Example: jaxshape inspect scan/
     """
@@ -55,11 +55,11 @@ class Inspect:
     ICL-NUIM, Open3D, Stray Scanner, Record3D, nerfstudio, or rgb/ depth/ masks/ with cam_K.txt; or
     an .npz file of arrays."""
     depth_scale: float | None = None
-    """Depth units in a metre, above 0; the layout's by default."""
+    """Depth units per metre, above 0; by default that of the layout."""
     layout: LayoutName | None = None
     """Layout of the files; detected by default."""
     convention: tuple[ConventionName, ...] = ()
-    """Conventions in which the recording is written, where it is not to be found out."""
+    """Conventions in which the recording is written; detected by default."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -123,7 +123,7 @@ def _pose_figures(poses: Any) -> dict[str, Any]:
 
 
 def _color_delay(sequence: Any) -> dict[str, float] | None:
-    """Seconds between depth images and their colour: how many usually, and at most."""
+    """Delay between depth images and their colour images, in seconds: median and maximum."""
     import numpy as np
 
     delays = () if sequence.color_delays is None else np.abs(sequence.color_delays)

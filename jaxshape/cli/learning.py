@@ -32,7 +32,7 @@ from jaxshape.reading import read_json_object
 from jaxshape.search.config import RefineConfig
 
 OWN_MESHES = DatasetConfig(paths=4)
-"""The dataset of a folder of meshes, which are few: each is filmed more often."""
+"""Settings of the dataset of a folder of meshes: there are few meshes, so each gets more paths."""
 
 PROCESSORS = os.cpu_count() or 1
 
@@ -42,7 +42,7 @@ TrainingPreset = Literal["default", "autoencoder", "paper"]
 
 @dataclass(frozen=True)
 class BuildDataset:
-    """Build training pairs: measurements along camera paths about objects, and complete surfaces.
+    """Build training pairs: measurements along camera paths around objects, and complete surfaces.
 
     Examples: jaxshape dataset --output data/chairs
 
@@ -54,8 +54,8 @@ class BuildDataset:
     """
 
     output: Path | None = None
-    """Folder of the dataset; data/chairs or data/tables, or data/NAME of --meshes NAME, where not
-    given. A build that was killed goes on when asked for again."""
+    """Folder of the dataset; by default data/chairs or data/tables, or data/NAME for --meshes NAME.
+    The same command resumes a build that was killed."""
     family: FamilyName = "chair"
     """Procedural objects to make, unless --meshes is given."""
     count: int = 8000
@@ -63,11 +63,11 @@ class BuildDataset:
     meshes: Path | None = None
     """Mesh, archive or folder (ShapeNet, ModelNet, ...) to use instead of procedural objects."""
     preset: Preset = "default"
-    """Defaults of the options below: the best that we found, or the paper's 18 clean single views,
-    which `jaxshape dataset --preset paper --help` shows."""
+    """Defaults of the options below: the best that we found, or the paper's 18 clean single views;
+    `jaxshape dataset --preset paper --help` shows the latter."""
     axes: AxesName = "given"
-    """`given` takes --up and --front for all meshes, and warns where they seem wrong; `auto` turns
-    each seat upright and forward."""
+    """`given` uses --up and --front for all meshes, and warns if they seem wrong; `auto` turns each
+    seat upright and to the front."""
     config: tyro.conf.OmitArgPrefixes[DatasetConfig] = DatasetConfig()
     workers: int = PROCESSORS
     """Processes that work at the same time, 1 to 256."""
@@ -83,11 +83,11 @@ class BuildDataset:
 
     @property
     def writes(self) -> Output:
-        """The folder that is written."""
+        """The output folder."""
         return Output(self.folder, goes_on=True, needs=max(limits.FREE_BYTES, self._missing()))
 
     def _missing(self) -> int:
-        """Bytes of procedural objects that are not there yet; meshes are counted later."""
+        """Bytes of the procedural objects that are still missing; meshes are counted later."""
         if self.meshes is not None:
             return 0
         voxels, paths = self.config.resolution**3, self.config.paths
@@ -104,7 +104,7 @@ class BuildDataset:
         build(self.folder, objects, self.config, self.workers)
 
     def find(self, meshes: Path) -> Sequence[Any]:
-        """The meshes, of which some are looked at for their unit and their axes."""
+        """The meshes; a sample of them is checked for unit and axes."""
         from jaxshape.data.survey import evenly
 
         config = self.config
@@ -117,7 +117,7 @@ class BuildDataset:
 
 
 def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: int) -> None:
-    """Build a dataset, or its missing shards, with a progress bar."""
+    """Build a dataset, or only its missing shards, with a progress bar."""
     from jaxshape.data import building
 
     skipped, notes = [], []
@@ -136,7 +136,7 @@ def build(folder: Path, objects: Sequence[Any], config: DatasetConfig, workers: 
 
 
 def preset_in(arguments: Sequence[str]) -> TrainingPreset:
-    """The name that --preset gives: of the defaults of the other options of `dataset`, `train`."""
+    """The value of --preset, which selects defaults of other options of `dataset` and `train`."""
 
     @dataclass(frozen=True)
     class Asked:
@@ -164,24 +164,24 @@ class Train:
     dataset: Path | None = None
     """Folder made by `jaxshape dataset`."""
     meshes: Path | None = None
-    """Mesh archive or folder (ShapeNet, ModelNet, ...) to train on, instead of --dataset."""
+    """Mesh archive or folder (ShapeNet, ModelNet, ...) to train on instead of --dataset."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
     name: str = "weights"
     """Name of the weights file and of its card; with --meshes, the kind of object."""
     output: Path | None = None
     """Folder for NAME.safetensors, NAME.md, card.json, metrics.jsonl and the checkpoint, and with
-    --meshes for the dataset and evaluation.json; out/NAME where not given."""
+    --meshes also for the dataset and evaluation.json; out/NAME by default."""
     start: Path | None = None
-    """Weights to begin with, of the same sizes, instead of random ones."""
+    """Initial weights, of a network of the same sizes; random by default."""
     licence: str = "not stated"
     """Licence of the weights, for their card; the licence of the meshes may restrict it."""
     model: Literal["network", "pca"] = "network"
-    """A network, or principal components of the complete surfaces: a cheap rival, made in seconds,
-    of which --code numbers and --seed are the only settings."""
+    """A network, or principal components of the complete surfaces: an inexpensive baseline, made in
+    seconds, whose only settings are the size of --code and --seed."""
     preset: TrainingPreset = "default"
-    """Network, and defaults of the options below: the network that is conditioned on the
-    measurement, the paper's auto-encoder at its best, or the paper's own training, which `jaxshape
-    train --preset paper --help` shows."""
+    """Network, and defaults of the options below: the network conditioned on the measurement, the
+    paper's auto-encoder with our best settings, or the paper's own training;
+    `jaxshape train --preset paper --help` shows the latter."""
     config: tyro.conf.OmitArgPrefixes[tyro.conf.AvoidSubcommands[TrainConfig]] = TrainConfig()
     machines: tyro.conf.OmitArgPrefixes[Machines] = Machines()
 
@@ -192,7 +192,7 @@ class Train:
 
     @property
     def writes(self) -> Output | None:
-        """The folder that is written; None with several processes, of which the first writes."""
+        """The output folder; None with several processes, of which only the first writes."""
         return None if self.machines.asked else Output(self.folder, goes_on=True)
 
     def run(self) -> None:
@@ -223,7 +223,7 @@ class Train:
             self.write(output, prior, about, held_out)
 
     def fit(self, output: Path, data: Any, start: Any) -> Any:
-        """The trained prior; None in all processes but the one that writes it."""
+        """The trained prior; None in all processes except the one that writes it."""
         if self.model == "pca":
             from jaxshape.data.dataset import surfaces
             from jaxshape.model.pca import fit
@@ -241,7 +241,7 @@ class Train:
             return prior._replace(calibration=fit_calibration(prior, kept.grids, kept.surface))
 
     def build(self, output: Path) -> tuple[Path, tuple[list[Any], list[Any]]]:
-        """The folder of a dataset of --meshes; the models kept out of it, and the skipped ones."""
+        """Build a dataset of --meshes; returns its folder, and held-out and skipped models."""
         import jax
 
         from jaxshape.data.split import hold_out
@@ -258,7 +258,7 @@ class Train:
         training, held_out = hold_out(found)
         lying = [one.source.name for one in usable if one.lies]
         check_axes([one.source for one in usable], lying, self.axes)
-        models = load_models(held_out, self.axes)  # refused now, not after hours of training
+        models = load_models(held_out, self.axes)  # refuse them now, not after hours of training
         config = replace(
             OWN_MESHES,
             up=self.axes.up,
@@ -289,7 +289,7 @@ class Train:
                 seed=self.config.seed,
             )
             settings = {"meshes": f"held out of {self.meshes}", "weights": str(weights)}
-            prior = load_prior(weights)  # as it is used: in half precision
+            prior = load_prior(weights)  # as users load it: in half precision
             scores = score(output / "evaluation.json", prior, config, settings, *held_out)
         write_text(output / f"{self.name}.md", describe(self.name, card, scores))
         print(f"wrote {weights} and its card, {self.name}.md")
@@ -309,7 +309,7 @@ class Train:
 
 
 def _fit(output: Path, data: Any, config: TrainConfig, start: Any) -> bool:
-    """Train with a bar; returns whether this process is the one that writes."""
+    """Train with a progress bar; returns whether this process is the one that writes."""
     import jax
 
     from jaxshape.model.training import read_metrics, train

@@ -1,4 +1,4 @@
-"""`jaxshape next`: from where an object should be filmed next."""
+"""`jaxshape next`: suggest the next views of an object."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +13,9 @@ from jaxshape.cli.common import console, require
 
 @dataclass(frozen=True)
 class NextView:
-    """Say from where to film an object next: the views that would tell most of what is hidden.
+    """Suggest where to film an object from next: views that reveal most of its hidden parts.
 
-    Left and right are the object's own, as of someone who sits on the chair.
+    Left and right are those of the object, as for a person sitting on the chair.
 
     Example: jaxshape next out/reconstruct
     """
@@ -23,7 +23,8 @@ class NextView:
     result: Positional[Path]
     """Finished folder made by `jaxshape reconstruct` or `jaxshape demo`."""
     distance: float | None = None
-    """Distance of the camera from the object's centre, in metres; as it was filmed by default."""
+    """Distance of the camera from the object's centre, in metres; by default that of the
+    recording."""
 
     def __post_init__(self) -> None:
         if self.distance is not None:
@@ -31,7 +32,7 @@ class NextView:
 
     @property
     def writes(self) -> Output:
-        """What is written."""
+        """The output folder."""
         return Output(self.result, goes_on=True)
 
     def run(self) -> None:

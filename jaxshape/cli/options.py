@@ -1,4 +1,4 @@
-"""Options that several commands take, and the ranges in which they make sense."""
+"""Options that several commands share, with checks of their ranges."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,10 +25,10 @@ class Axes:
     up: Axis = "y"
     """Axis of the meshes that points up."""
     front: Axis = "z"
-    """Axis of the meshes along which the object's front looks; perpendicular to --up."""
+    """Axis of the meshes towards which the object faces; perpendicular to --up."""
     axes: AxesName = "given"
-    """`given` takes --up and --front for all meshes, and warns where they seem wrong; `auto` turns
-    each mesh upright and forward, as far as the weights for chairs know its kind."""
+    """`given` uses --up and --front for all meshes, and warns if they seem wrong; `auto` turns each
+    mesh upright and to the front, if the weights for chairs know its kind."""
     unit: UnitName = "m"
     """Unit of the meshes: metres, centimetres, millimetres or inches."""
 
@@ -38,20 +38,20 @@ class Axes:
 
 @dataclass(frozen=True, kw_only=True)
 class Seen:
-    """The depth camera, and how its frames are fused."""
+    """The depth camera, and the fusion of its frames."""
 
     camera: CameraName = "kinect"
     """Depth camera: the first Kinect (640 x 480 pixels), an Intel RealSense, the LiDAR of an iPhone
     (256 x 192), or the paper's square images of 96 pixels."""
     noise: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Give depth images the faults of the camera's sensor, as is done anyway for all cameras but
-    the paper's."""
+    """Give depth images the faults of the camera's sensor; the default for all cameras except the
+    paper's."""
     no_noise: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Leave these faults out, as is done anyway for the paper's camera."""
+    """Leave these faults out; the default for the paper's camera."""
     fusion: FusionName | None = None
     """Method that turns frames into F and M: `distance` averages signed distances on a fine grid,
-    `points` counts points in voxels (paper). None for points with the paper's camera without noise,
-    and for distances otherwise."""
+    `points` counts points in voxels (paper). None selects points for the paper's camera without
+    noise, and distances otherwise."""
 
     def config(self) -> CameraConfig:
         """The settings, checked."""
@@ -62,8 +62,8 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True)
 class Machines:
-    """All devices of a machine are used anyway. Several machines work together, one process on
-    each, where all see the same files.
+    """All devices of a machine are always used. Several machines can work together, with one
+    process on each, if all can access the same files.
 
     Under Slurm: srun --ntasks-per-node=1 jaxshape COMMAND --distributed ...
 
@@ -72,9 +72,9 @@ class Machines:
     """
 
     distributed: bool = False
-    """Join the processes that Slurm or Open MPI started together."""
+    """Join the other processes that Slurm or Open MPI started with this one."""
     coordinator: str | None = None
-    """Join processes started by hand: HOST:PORT of the first process, the same for all."""
+    """Join processes started by hand: HOST:PORT of the first process, the same in all processes."""
     processes: int | None = None
     """With --coordinator: number of processes."""
     process: int | None = None
@@ -87,7 +87,7 @@ class Machines:
         return self.distributed or given != (None, None, None)
 
     def join(self, **how: Any) -> None:
-        """Join the others, if there are any; to be called before JAX computes.
+        """Join the other processes, if there are any; to be called before JAX computes.
 
         `how` are further arguments of `join_processes`.
         """
@@ -101,12 +101,12 @@ class Machines:
 class RefusedSetting(Exception):
     """Settings refused the values of the parser, in one sentence.
 
-    Not a `ValueError`, for the parser would make a page of its own of that.
+    It is not a `ValueError`, because the parser would turn that into a page of its own.
     """
 
 
 def reworded(problem: ValueError) -> str:
-    """The sentence of a refusal, with the option in place of the field."""
+    """The message of a refused setting, with the name of the option instead of the field."""
     if not isinstance(problem, BadSetting):
         return str(problem)
     value = problem.value
@@ -115,14 +115,14 @@ def reworded(problem: ValueError) -> str:
 
 
 def refusing() -> ConstructorRegistry:
-    """Rules for the parser, by which the refusals of settings end in `RefusedSetting`."""
+    """Rules for the parser, which turn refusals of settings into `RefusedSetting`."""
     registry, asked = ConstructorRegistry(), []
 
     @registry.struct_rule
     def rule(info: StructTypeInfo) -> Any:
         if asked or not hasattr(info.type, "__post_init__"):
             return None
-        asked.append(info)  # so that the rules of the parser answer, not this one again
+        asked.append(info)  # so that the parser's own rules apply, not this one again
         try:
             spec = ConstructorRegistry.get_struct_spec(info)
         finally:
@@ -135,7 +135,7 @@ def refusing() -> ConstructorRegistry:
 
 
 def _refusing(build: Callable[..., Any]) -> Callable[..., Any]:
-    """A constructor whose `ValueError` ends in `RefusedSetting`."""
+    """A constructor that raises `RefusedSetting` in place of `ValueError`."""
 
     @wraps(build)
     def built(*values: Any, **fields: Any) -> Any:
@@ -148,7 +148,7 @@ def _refusing(build: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def checked_numbers(text: str, option: str) -> tuple[int, ...]:
-    """Different whole numbers from 1 up, given with commas."""
+    """Parse distinct whole numbers, 1 or more, separated by commas."""
     try:
         numbers = tuple(int(part) for part in text.split(","))
     except ValueError:

@@ -1,4 +1,4 @@
-"""`jaxshape demo`, and what it has in common with `jaxshape reconstruct`."""
+"""`jaxshape demo`, and the options that it shares with `jaxshape reconstruct`."""
 
 import time
 from dataclasses import asdict, dataclass
@@ -47,7 +47,7 @@ class Rebuild:
         checks.seed("seed", self.seed)
 
     def prepare(self, family: FamilyName = "chair") -> tuple[Any, Any, RefineConfig]:
-        """The prior, the search and its settings, so that bad options are refused before work."""
+        """The prior, the search and its settings; bad options are refused here, before any work."""
         from jaxshape.model.weights import load_prior
         from jaxshape.search.reconstruction import refiner_for
 
@@ -57,8 +57,8 @@ class Rebuild:
     def placer(self, prior: Any) -> Any:
         """The prior that finds an object's frame.
 
-        For the package's chairs that is the auto-encoder. It finds fronts and sizes better, in half
-        the time: a decoder that knows the measurement explains it in any frame.
+        For the package's chairs it is the auto-encoder. It finds fronts and sizes better, in half
+        the time: a decoder conditioned on the measurement explains it in any frame.
         """
         from jaxshape.model.weights import load_prior
 
@@ -66,13 +66,13 @@ class Rebuild:
         return load_prior("chair-autoencoder") if packaged else prior
 
     def method_for(self, prior: Any) -> str:
-        """The method that was asked for, or the usual one of the prior."""
+        """The requested method, or the default of the prior."""
         from jaxshape.search.reconstruction import usual_method
 
         return self.method or usual_method(prior)
 
     def weights_for(self, family: FamilyName = "chair") -> str:
-        """The weights file that was asked for, or the name of the package's for a family."""
+        """The requested weights file, or the name of the package's weights for a family."""
         from jaxshape.model.weights import packaged_for
 
         return str(self.weights) if self.weights else packaged_for(family)
@@ -80,7 +80,7 @@ class Rebuild:
     def settings(
         self, prior: Any, fusion: FusionName, family: FamilyName = "chair"
     ) -> dict[str, Any]:
-        """Settings of the search for result.json, of grids that are fused in this way."""
+        """Settings of the search for result.json, with the objective for this fusion method."""
         objective = self.search.objective or objective_for(fusion)
         search = asdict(self.search) | {"objective": objective}
         weights = self.weights_for(family)
@@ -101,7 +101,7 @@ class Rebuild:
 
 
 def written(folder: Path, observation: Any, found: Any, figures: dict[str, Any]) -> dict[str, Any]:
-    """Write the files of a result, its picture and its report; the content of result.json."""
+    """Write a result's files, picture and report; returns the content of result.json."""
     from jaxshape.results.output import write_result
 
     with console.status("drawing"):
@@ -131,8 +131,8 @@ def report_objective(result: dict[str, Any]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Rebuild):
-    """Rebuild a procedural object nobody trained on from frames like a Kinect's along an orbit, and
-    compare with the truth.
+    """Rebuild a procedural object that is not in the training set from simulated Kinect frames
+    along an orbit, and compare with the truth.
 
     Examples: jaxshape demo --seed 3
 
@@ -142,9 +142,9 @@ class Demo(Rebuild):
     """
 
     family: FamilyName = "chair"
-    """Class of the object. Without --weights, tables too are rebuilt by the network for chairs."""
+    """Class of the object. Without --weights, the network for chairs also rebuilds tables."""
     frames: int = 6
-    """Depth frames along the orbit, 20 degrees apart, 1 to 180: ten times around."""
+    """Depth frames along the orbit, 20 degrees apart, 1 to 180 (ten turns)."""
     seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     output: Path = Path("out/demo")
     """Folder for mesh.glb, mesh.ply, grid.npz, trace.npz, result.json, overview.png and
@@ -156,7 +156,7 @@ class Demo(Rebuild):
 
     @property
     def writes(self) -> Output:
-        """The folder that is written."""
+        """The output folder."""
         return Output(self.output)
 
     def run(self) -> None:

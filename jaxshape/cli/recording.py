@@ -20,10 +20,10 @@ from jaxshape.mapping.config import MappingConfig, TrackingConfig
 class Reconstruct(Rebuild):
     """Rebuild an object from an RGB-D recording: find it, track the camera, map it.
 
-    The object is found by itself where it is alone and central, or by a click, a region, a depth
-    range, masks beside the images, or its box. Poses are used where they are given. A run that was
-    killed goes on when the same command is given again; `jaxshape view` shows it while it runs.
-    The last lines say how far the result can be believed; the exit status is 3 where it cannot.
+    The object is found automatically if it is alone and central, or by a click, a region, a depth
+    range, masks beside the images, or its box. Poses are used if they are given. The same command
+    resumes a run that was killed; `jaxshape view` shows it while it runs. The last lines state how
+    reliable the result is; the exit status is 3 if it failed.
 
     Examples: jaxshape reconstruct scan/
 
@@ -35,44 +35,44 @@ class Reconstruct(Rebuild):
     """
 
     frames: Positional[Path]
-    """Folder of a recording; `jaxshape inspect` says what it holds."""
+    """Folder of a recording; `jaxshape inspect` describes its content."""
     click: tuple[float, float] | None = None
     """Column and row of a pixel of the first frame that shows the object."""
     region: tuple[float, float, float, float] | None = None
-    """Left, top, right and bottom of a part of the first frame that holds the object alone."""
+    """Left, top, right and bottom of a part of the first frame that contains only the object."""
     depth_range: tuple[float, float] | None = None
     """Nearest and farthest depth of the object in the first frame, in metres."""
     list_objects: Annotated[bool, tyro.conf.arg(name="list")] = False
-    """Number the objects that the first frame shows in objects.png, and do nothing else."""
+    """Only number the objects of the first frame, in objects.png."""
     object: int | None = None
-    """Number of the object, as --list shows them."""
+    """Number of the object, as shown by --list."""
     box: Path | None = None
     """JSON file with the object's box: {"T_world_object": 4x4, "size": [x, y, z]}. The object
     frame has +y up and its front along +z; the world is that of the poses or, without poses, the
     frame of the first camera."""
     poses: Literal["auto", "given", "first", "none"] = "auto"
-    """Given poses to use: all (auto: where there are any), the first alone, or none."""
+    """Which of the recorded poses to use: all (auto: if there are any), only the first, or none."""
     first: int = 0
     """Number of the first frame, from 0."""
     every: int = 1
-    """Use every n-th frame, n being 1 or more."""
+    """Use every n-th frame, 1 or more."""
     depth_scale: float | None = None
-    """Depth units in a metre, above 0; found out by default, or those of the layout."""
+    """Depth units per metre, above 0; by default detected, or that of the layout."""
     convention: tuple[ConventionName, ...] = ()
-    """Conventions in which poses and depth are written; found out by default."""
+    """Conventions in which poses and depth are written; detected by default."""
     guess_camera: bool = False
-    """Take the usual camera of such recordings where the folder holds none."""
+    """If the folder has no camera, use the usual camera of such recordings."""
     tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
     mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
     fresh: bool = False
-    """Begin anew even if an unfinished run lies in the output folder."""
+    """Start again even if the output folder has an unfinished run."""
     output: Path = Path("out/reconstruct")
     """Folder for mesh.glb, mesh.ply, grid.npz, trajectory.txt, keyframes.json, result.json,
     report.html and more."""
 
     @property
     def writes(self) -> Output:
-        """What is written."""
+        """The output folder."""
         return Output(self.output, goes_on=True)
 
     def run(self) -> None:
@@ -161,7 +161,7 @@ class Reconstruct(Rebuild):
             ):
                 bar.update(task, completed=len(progress.logs), note=_note(progress))
                 if progress.logs[-1].status != "keyframe" or progress.shape is None:
-                    continue  # what lies in the folder stays until something is measured
+                    continue  # files in the folder stay until something is measured
                 save_state(self.output, progress, settings)
                 began = time.perf_counter()
                 if began > next_write:
@@ -182,7 +182,7 @@ class Reconstruct(Rebuild):
             sys.exit(3)
 
     def _list_objects(self, sequence: Any) -> None:
-        """Write a picture of what the first frame shows, and the size of each object."""
+        """Write a picture of the objects in the first frame, and print the size of each."""
         from jaxshape.mapping.placement.finding import first_readable
         from jaxshape.mapping.segmentation.proposals import propose
         from jaxshape.report.proposals import write_proposals
@@ -234,9 +234,9 @@ def opened(
     convention: tuple[ConventionName, ...],
     guess_camera: bool,
 ) -> Any:
-    """The recording as it is to be read, and what was noticed (`Inspection`).
+    """Open and inspect a recording (`Inspection`): how it is to be read, and warnings.
 
-    Refuses a guessed camera, and a first frame that is not there.
+    Refuses a guessed camera unless allowed, and a first frame that does not exist.
     """
     from jaxshape.data.sequences import open_sequence
     from jaxshape.data.sequences.inspection import inspect_sequence

@@ -20,9 +20,9 @@ from jaxshape.search.config import RefineConfig
 class BuildScene:
     """Rebuild all objects of a room from an RGB-D recording, each of its own class.
 
-    Whatever has the size of furniture and stands on the floor or on a table becomes an object. The
-    priors decide what it is and which way it looks; what is of none of their classes is kept as it
-    was measured, and nothing is added to it. What was moved while it was filmed is left out.
+    Everything that has the size of furniture and stands on the floor or on a table becomes an
+    object. The priors decide its class and which way it faces; an object of no known class is kept
+    as measured, without completion. Objects that moved during the recording are left out.
 
     Examples: jaxshape scene room/
 
@@ -32,27 +32,26 @@ class BuildScene:
     """
 
     frames: Positional[Path]
-    """Folder of a recording; `jaxshape inspect` says what it holds."""
+    """Folder of a recording; `jaxshape inspect` describes its content."""
     prior: dict[str, Path] = field(default_factory=dict)
-    """Classes and their weights, besides those that come with the package: NAME FILE ..."""
+    """Further classes and their weights, in addition to those of the package: NAME FILE ..."""
     method: str | None = None
-    """How codes are searched, as of `jaxshape reconstruct`; None for the usual way of each
-    network."""
+    """Search method, as in `jaxshape reconstruct`; None for the default of each network."""
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
     seed: int = 0
     """Seed of all random numbers, 0 or more."""
     poses: Literal["auto", "none"] = "auto"
-    """Given poses to use: all (auto: where there are any), or none."""
+    """Which of the recorded poses to use: all (auto: if there are any), or none."""
     first: int = 0
     """Number of the first frame, from 0."""
     every: int = 1
-    """Use every n-th frame, n being 1 or more."""
+    """Use every n-th frame, 1 or more."""
     depth_scale: float | None = None
-    """Depth units in a metre, above 0; found out by default, or those of the layout."""
+    """Depth units per metre, above 0; by default detected, or that of the layout."""
     convention: tuple[ConventionName, ...] = ()
-    """Conventions in which poses and depth are written; found out by default."""
+    """Conventions in which poses and depth are written; detected by default."""
     guess_camera: bool = False
-    """Take the usual camera of such recordings where the folder holds none."""
+    """If the folder has no camera, use the usual camera of such recordings."""
     tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
     mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
     output: Path = Path("out/scene")
@@ -65,7 +64,7 @@ class BuildScene:
 
     @property
     def writes(self) -> Output:
-        """What is written."""
+        """The output folder."""
         return Output(self.output)
 
     def run(self) -> None:
@@ -128,7 +127,7 @@ class BuildScene:
         self._conclude(result)
 
     def _picture(self, sequence: Any, scene: Any) -> None:
-        """Write objects.png: the keyframe that shows most of the objects."""
+        """Write objects.png: the keyframe that shows the objects best."""
         import numpy as np
 
         from jaxshape.report.proposals import write_proposals

@@ -1,4 +1,4 @@
-"""`jaxshape evaluate` and `jaxshape plot`: how good results are, and how a search went."""
+"""`jaxshape evaluate` and `jaxshape plot`: the quality of results, and the course of a search."""
 
 import time
 from collections.abc import Sequence
@@ -20,12 +20,12 @@ from jaxshape.files import write_json
 from jaxshape.search.config import RefineConfig
 
 PATIENCE = 30 * 24 * 3600
-"""Seconds that a process which is done waits for the others: shares of an evaluation differ."""
+"""Seconds that a finished process waits for the others, since shares of an evaluation differ."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Score methods on meshes seen along an orbit at 30 degrees elevation.
+    """Score methods on meshes that are viewed along an orbit at 30 degrees elevation.
 
     Example: jaxshape evaluate --meshes chairs/ --frames 1,4,8,18 --methods encoder,gradient,cma
     --output scores.json
@@ -34,10 +34,10 @@ class Evaluate:
     output: Path
     """JSON file for config, per_mesh and means."""
     meshes: Path | None = None
-    """Mesh, archive (.zip, .sh3f) or folder of meshes; none should have been trained on."""
+    """Mesh, archive (.zip, .sh3f) or folder of meshes; none should be in the training set."""
     axes: tyro.conf.OmitArgPrefixes[Axes] = Axes()
     family: FamilyName = "chair"
-    """Class of the objects. Without --weights, tables too are rebuilt by the network for chairs."""
+    """Class of the objects. Without --weights, the network for chairs also rebuilds tables."""
     count: int = 0
     """Number of procedural test objects to use instead of --meshes."""
     frames: str = "1,4,8,18"
@@ -47,7 +47,7 @@ class Evaluate:
     --method`."""
     seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     ceiling: bool = False
-    """Score the best shape of the weights, too: the code fitted to the whole truth."""
+    """Also score the best shape of the weights: the code fitted to the complete truth."""
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
@@ -57,7 +57,7 @@ class Evaluate:
 
     @property
     def writes(self) -> Output | None:
-        """The file that is written; several processes share it."""
+        """The output file; None with several processes, which share it."""
         return None if self.machines.asked else Output(self.output, is_file=True, goes_on=True)
 
     def run(self) -> None:
@@ -85,7 +85,7 @@ class Evaluate:
         sources: Any = find_meshes(self.meshes) if self.meshes else procedural
         packaged = packaged_for(self.family)
         prior = load_prior(self.weights or packaged)
-        evaluation.by_each_method(prior, config)  # refuses unknown methods before meshes are read
+        evaluation.by_each_method(prior, config)  # refuse unknown methods before meshes are read
         share = Share(jax.process_index(), jax.process_count())
         names = [source.name for source in sources]
         mine = share.of(sources)
@@ -123,9 +123,9 @@ def score(
 ) -> dict[str, Any] | None:
     """Score models, write the results file, print its table; returns the content of the file.
 
-    `config` is an `EvaluateConfig`; `about` says where meshes and weights come from. An evaluation
-    that was killed goes on when asked for again with the same weights and settings. Several
-    processes each score their share of all `names`; the last to finish finds the rows of the others
+    `config` is an `EvaluateConfig`; `about` holds the origin of meshes and weights. A killed
+    evaluation resumes when it is started again with the same weights and settings. Several
+    processes each score their share of all `names`; the last to finish reads the rows of the others
     and writes the file, and the others return None. `share` is a `Share`; None for a single
     process.
     """
@@ -139,7 +139,7 @@ def score(
     settings = asdict(config) | resolved | about
     stamp = settings | {"fingerprint": fingerprint(prior)}
     names = [one.name for one in (*models, *skipped)] if names is None else names
-    for earlier in journals_of(output, stamp):  # of files that have changed since
+    for earlier in journals_of(output, stamp):  # drop rows of files that have changed since
         earlier.forget({model.name: model.digest for model in models})
     journal = (share or Share()).journal(output, stamp)
     scored = {name for name, row in _rows(output, stamp).items() if "skipped" not in row}
@@ -183,7 +183,7 @@ def score(
 
 
 def _rows(output: Path, stamp: dict[str, Any]) -> dict[str, Any]:
-    """The rows of all processes so far; scores win over an earlier reason to skip a mesh."""
+    """The rows of all processes so far; a score replaces an earlier reason to skip a mesh."""
     from jaxshape.results.journal import journals_of
 
     found = [row for one in journals_of(output, stamp) for row in one.rows.items()]
@@ -193,7 +193,7 @@ def _rows(output: Path, stamp: dict[str, Any]) -> dict[str, Any]:
 def _print_table(means: dict[str, Any], count: int) -> None:
     from jaxshape.report.card import COLUMNS, rows_of
 
-    title, padding = f"means over {count} meshes", (0, 1, 0, 0)  # 80 columns hold the table
+    title, padding = f"means over {count} meshes", (0, 1, 0, 0)  # fits into 80 columns
     table = Table(title=title, title_justify="left", box=None, padding=padding, pad_edge=False)
     for column in COLUMNS:
         named = column == "method"
@@ -206,7 +206,7 @@ def _print_table(means: dict[str, Any], count: int) -> None:
 
 @dataclass(frozen=True)
 class Plot:
-    """Plot the search behind a result, or compare several.
+    """Plot the search of a result, or compare several.
 
     Examples: jaxshape plot out/demo
 
@@ -220,7 +220,7 @@ class Plot:
 
     @property
     def writes(self) -> Output | None:
-        """The file that is written; None where it goes into the folder of an existing result."""
+        """The output file; None if it goes into the folder of an existing result."""
         return None if self.output is None else Output(self.output, is_file=True)
 
     def run(self) -> None:

@@ -1,4 +1,4 @@
-"""`jaxshape view`: a result in the browser, also while it is being made."""
+"""`jaxshape view`: show a result in the browser, also while it is being made."""
 
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -12,7 +12,8 @@ from jaxshape.cli.common import require
 @dataclass(frozen=True)
 class ViewResult:
     """Show a result folder in the browser: the shape, grids and cameras, or the objects of a scene,
-    to turn and to switch on and off. While the folder is being written, the picture follows.
+    which can be turned and switched on and off. While the folder is being written, the view is
+    updated.
 
     Example: jaxshape view out/demo
     """
@@ -20,9 +21,10 @@ class ViewResult:
     result: Positional[Path]
     """Folder made by `jaxshape reconstruct`, `scene` or `demo`, finished or not."""
     port: int = 8080
-    """Port to serve at, 1 to 65535; the next free one if it is taken."""
+    """Port to serve on, 1 to 65535; the next free one if it is taken."""
     host: str = "127.0.0.1"
-    """Address to listen at; with any other than this one, others on the network see the result."""
+    """Address to listen on; with any other than the default, others on the network can see the
+    result."""
 
     def run(self) -> None:
         require(
