@@ -1,9 +1,9 @@
-"""Checks by which settings refuse wrong values: one sentence with what was given and what to give.
+"""Checks that refuse wrong values of settings, in one sentence with the given and the valid values.
 
 A settings dataclass calls them in its `__post_init__`. Each raises a `BadSetting`, a `ValueError`
 that begins with the name of the field, as in "population is 2; give a whole number, 3 or more.";
-the command line puts the name of its option there. Numbers that JAX traces have no value yet and
-pass.
+the command line replaces the field by the name of its option. Numbers that JAX traces have no value
+yet and are not checked.
 """
 
 import math
@@ -30,7 +30,7 @@ class BadSetting(ValueError):
 
 
 def refuse(name: str, value: Any, wanted: str) -> NoReturn:
-    """Say that a setting has a wrong value.
+    """Raise the error for a wrong value of a setting.
 
     Args:
         name: Name of the field.
@@ -44,7 +44,7 @@ def refuse(name: str, value: Any, wanted: str) -> NoReturn:
 
 
 def one_of(name: str, value: Any, choices: Iterable[Any]) -> None:
-    """Refuse a value that is none of the choices.
+    """Refuse a value that is not one of the choices.
 
     Args:
         name: Name of the field.
@@ -57,7 +57,7 @@ def one_of(name: str, value: Any, choices: Iterable[Any]) -> None:
 
 
 def whole(name: str, value: Any, least: int, most: int | None = None, why: str = "") -> None:
-    """Refuse what is not a whole number in a range.
+    """Refuse a value that is not a whole number in a range.
 
     Args:
         name: Name of the field.
@@ -73,7 +73,7 @@ def whole(name: str, value: Any, least: int, most: int | None = None, why: str =
 
 
 def seed(name: str, value: Any) -> None:
-    """Refuse what is no seed of random numbers: a whole number of 32 bits.
+    """Refuse a value that is not a seed of random numbers: a whole number of 32 bits.
 
     Args:
         name: Name of the field.
@@ -83,7 +83,7 @@ def seed(name: str, value: Any) -> None:
 
 
 def positive(name: str, value: Any, unit: str = "") -> None:
-    """Refuse what is not a finite number above 0.
+    """Refuse a value that is not a finite number above 0.
 
     Args:
         name: Name of the field.
@@ -95,7 +95,7 @@ def positive(name: str, value: Any, unit: str = "") -> None:
 
 
 def at_least(name: str, value: Any, least: int | float) -> None:
-    """Refuse what is not a finite number from `least` up.
+    """Refuse a value that is not a finite number, `least` or more.
 
     Args:
         name: Name of the field.
@@ -107,7 +107,7 @@ def at_least(name: str, value: Any, least: int | float) -> None:
 
 
 def within(name: str, value: Any, low: int | float, high: int | float) -> None:
-    """Refuse what is not a number between two others, or one of them.
+    """Refuse a value that is not a number in a range, limits included.
 
     Args:
         name: Name of the field.
@@ -120,17 +120,17 @@ def within(name: str, value: Any, low: int | float, high: int | float) -> None:
 
 
 def is_traced(value: Any) -> bool:
-    """Whether a value is known only when a program of JAX runs: under `jax.jit` or `jax.vmap`.
+    """Whether JAX traces a value, as under `jax.jit` or `jax.vmap`, so that it is not known yet.
 
     Args:
-        value: Any value. JAX is not imported to find out.
+        value: Any value. The check does not import JAX.
     """
     core = sys.modules.get("jax.core")
     return core is not None and isinstance(value, core.Tracer)
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value is a real number or an array of one; NaN is, and fails every comparison."""
+    """Whether a value is a real number or an array of one; NaN is, and fails all comparisons."""
     if hasattr(value, "dtype") and getattr(value, "ndim", None) == 0:
         value = value.item()
     return isinstance(value, Real) and not isinstance(value, bool)

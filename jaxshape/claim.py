@@ -1,4 +1,4 @@
-"""One writer for each output, which is found to be writable before the work. [host]"""
+"""Allow one writer for each output, and check before the work that it can be written. [host]"""
 
 import os
 import shutil
@@ -22,8 +22,8 @@ class Output(NamedTuple):
     Attributes:
         path: Folder or file of the output.
         is_file: Whether it is one file.
-        goes_on: Whether the same command, given again, goes on where it was stopped.
-        needs: Free bytes without which it is not begun.
+        goes_on: Whether the same command, given again, resumes where it was stopped.
+        needs: Free bytes that the disk must have at the start.
     """
 
     path: Path
@@ -46,16 +46,17 @@ class Output(NamedTuple):
 
 @contextmanager
 def claimed(output: Output) -> Iterator[None]:
-    """Keep an output to oneself for the block that writes it.
+    """Lock an output for the block that writes it.
 
-    The folder is made if it is missing, and removed again if nothing came into it. What a killed
-    writer left half done is removed.
+    The folder is made if it is missing, and removed again if nothing was written to it. Unfinished
+    files of a killed writer are removed.
 
     Args:
         output: The output to claim.
 
     Raises:
-        OutputError: It cannot be written, is too small, or another process is writing it.
+        OutputError: The output cannot be written, its disk has too little space, or another process
+            is writing it.
     """
     _check_kind(output)
     made = [one for one in (output.folder, *output.folder.parents) if not one.exists()]
@@ -111,7 +112,7 @@ def _lock_file(output: Output) -> Path:
 
 
 def _locked(output: Output) -> int:
-    """The open file that others find locked while this process lives; it names the process."""
+    """Open and lock the lock file until this process ends; the file holds the process number."""
     path = _lock_file(output)
     while True:
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never finds half of one."""
+"""Write files so that a reader never finds a half-written one."""
 
 import errno
 import json
@@ -27,25 +27,25 @@ _REASONS = {
 
 
 class OutputError(OSError):
-    """A file cannot be written; says which folder, and why."""
+    """A file cannot be written; the message names the folder and the reason."""
 
 
 def unwritable(folder: Path, problem: Exception) -> OutputError | None:
-    """The error that says why nothing can be written to a folder.
+    """The error that explains why nothing can be written to a folder.
 
     Args:
         folder: The folder.
         problem: The error of a write.
 
     Returns:
-        The error; None where the problem is another.
+        The error; None if the problem is of another kind.
     """
     if isinstance(problem, OutputError):
         return problem
     is_full = folder.is_dir() and shutil.disk_usage(folder).free < 2**20
     if isinstance(problem, OSError) and problem.errno in _REASONS:
         reason = _REASONS[problem.errno]
-    elif is_full or "requested and" in str(problem):  # as NumPy says it
+    elif is_full or "requested and" in str(problem):  # NumPy's message
         reason = _REASONS[errno.ENOSPC]
     elif isinstance(problem, OSError):
         reason = problem.strerror or str(problem)
@@ -96,10 +96,10 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
     Args:
         path: The file; its folder is made if missing.
-        text: All that the file will hold.
+        text: Content of the file.
     """
     with atomic_path(path) as temporary:
-        # A name that is not UTF-8 on disk has letters that UTF-8 has not.
+        # A file name that is not UTF-8 has characters that cannot be encoded in UTF-8.
         temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
@@ -111,13 +111,13 @@ def write_json(path: str | os.PathLike[str], content: Any) -> None:
         content: Dictionaries, lists, strings, numbers, booleans and None.
 
     Raises:
-        TypeError: Where `content` holds something else, such as an array; nothing is written.
+        TypeError: `content` holds something else, such as an array; nothing is written.
     """
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def _mode_of(target: Path) -> int:
-    """Return the permissions `target` has, or those a file opened anew would get."""
+    """The permissions of `target`, or those that a new file would get."""
     if target.exists():
         return target.stat().st_mode & 0o777
     umask = os.umask(0)  # the only way to read it is to set it

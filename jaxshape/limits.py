@@ -1,4 +1,4 @@
-"""Limits of what is read and asked for; each is checked before memory or time is taken.
+"""Limits of input files and options; each is checked before it can cost memory or time.
 
 `docs/reliability.md` has them in a table, reader by reader. Imports nothing of jaxshape.
 """
@@ -8,10 +8,11 @@ MIB, GIB = 2**20, 2**30
 # Text and JSON ---------------------------------------------------------------------------------
 
 TEXT_BYTES = 64 * MIB
-"""Size of a text file, whose words take ten times as much; an hour of poses has a quarter."""
+"""Size of a text file, whose words take ten times as much memory; an hour of poses has a
+quarter."""
 
 JSON_BYTES = 64 * MIB
-"""Size of a JSON file; 50,000 frames of nerfstudio take as much."""
+"""Size of a JSON file; 50,000 frames of nerfstudio have this size."""
 
 JSON_VALUES = 5_000_000
 """Values in a JSON file, each of which takes some 50 bytes of memory."""
@@ -23,7 +24,7 @@ PATH_LENGTH = 1024
 """Characters of a path that a file names."""
 
 FAR = 1e7
-"""Largest coordinate, in metres; where poses are written in millimetres, that is 10 km."""
+"""Largest coordinate, in metres; for poses written in millimetres it is 10 km."""
 
 BOX_SIZE = (1e-3, 1e3)
 """Least and greatest extent of an object's box, in metres."""
@@ -34,7 +35,7 @@ IMAGE_BYTES = 256 * MIB
 """Size of an image file."""
 
 DEPTH_PIXELS = 4096 * 4096
-"""Pixels of a depth image; those of depth cameras have 4 million at most."""
+"""Pixels of a depth image; depth cameras have at most 4 million."""
 
 COLOR_PIXELS = 8192 * 4096
 """Pixels of a colour image or a mask, which take 4 bytes each while it is decoded."""
@@ -49,7 +50,7 @@ ARRAY_BYTES = 4 * GIB
 """Size of all arrays of an .npz file that are read, unpacked."""
 
 ARRAY_RATIO, ARRAY_FREE = 200, 64 * MIB
-"""Bytes that a byte of an .npz file may unpack to, once its arrays are larger than the second."""
+"""Bytes to which a byte of an .npz file may unpack, for arrays larger than the second number."""
 
 ARRAY_ENTRIES = 100_000
 """Arrays of an .npz file, and of a file of weights."""
@@ -72,7 +73,7 @@ CLOUD_POINTS = 100_000_000
 """Points of a point cloud in a file."""
 
 CLOUD_TEXT_BYTES = 128 * MIB
-"""Size of the points of a point cloud that are written as text: words take ten times as much."""
+"""Size of the points of a point cloud in text form: words take ten times as much memory."""
 
 # Options ---------------------------------------------------------------------------------------
 
@@ -98,10 +99,10 @@ RESOLUTION = 512
 """Voxels along each axis of a grid."""
 
 CODE = 10_000
-"""Numbers in a code, whose covariance has their square."""
+"""Dimension of a code, whose covariance has its square."""
 
 PATHS = 1_000
-"""Camera paths about an object of a dataset."""
+"""Camera paths around an object of a dataset."""
 
 WORKERS = 256
 """Processes that work at the same time, each of which takes 0.3 GB."""
@@ -109,7 +110,7 @@ WORKERS = 256
 # Disk ------------------------------------------------------------------------------------------
 
 FREE_BYTES = 64 * MIB
-"""Free space without which no result is begun; results with pictures and meshes take half of it."""
+"""Free space needed to begin a result; a result with pictures and meshes takes half of it."""
 
 CACHE_BYTES = 2 * GIB
 """Size of all compiled programs that are kept; the oldest are removed."""

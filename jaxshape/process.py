@@ -1,4 +1,4 @@
-"""Settings of a process that must stand before JAX computes, or is even imported. [host]"""
+"""Settings of a process that must be made before JAX computes, or even before its import. [host]"""
 
 import os
 import platform
@@ -14,10 +14,10 @@ from jaxshape.limits import CACHE_BYTES
 
 
 def prepare_process() -> None:
-    """Settings for the command line; to be called before JAX is imported.
+    """Prepare the process of a command; to be called before JAX is imported.
 
     Compiled programs are kept (`keep_compiled`), and LAPACK gets one thread: the covariances of a
-    search are too small to share, and waiting threads make a busy machine many times slower.
+    search are too small to split, and waiting threads make a busy machine many times slower.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     keep_compiled()
@@ -29,7 +29,7 @@ class Terminated(KeyboardInterrupt):
 
 
 def end_in_order() -> None:
-    """Let SIGTERM end this process as Ctrl-C does; a second one ends it at once."""
+    """Let SIGTERM end this process like Ctrl-C; a second SIGTERM ends it at once."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
 
@@ -41,12 +41,12 @@ def _terminate(number: int, frame: Any) -> NoReturn:
 
 
 def keep_compiled() -> None:
-    """Let JAX keep what it compiles, so that the next process need not compile it again.
+    """Let JAX store compiled programs, so that the next process need not compile them again.
 
-    JAX reads its settings from the environment; those that are set there already win, so
-    `JAX_ENABLE_COMPILATION_CACHE=false` turns this off and `JAX_COMPILATION_CACHE_DIR` names
-    another folder, whose size is then not bounded. Where the folder cannot be written, nothing is
-    kept, and a program that cannot be read again is compiled anew.
+    JAX reads its settings from the environment, and existing settings take precedence:
+    `JAX_ENABLE_COMPILATION_CACHE=false` turns this off, and `JAX_COMPILATION_CACHE_DIR` names
+    another folder, whose size is then not bounded. If the folder cannot be written, nothing is
+    stored; a stored program that cannot be read is compiled again.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
@@ -56,16 +56,17 @@ def keep_compiled() -> None:
         return
     bound_folder(folder, CACHE_BYTES)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-    # By default, only what took a second or more; but a command also compiles dozens of small ones.
+    # JAX's default is one second, but a command also compiles dozens of small programs.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
 def bound_folder(folder: Path, most: int) -> None:
-    """Remove the files of a folder that were used longest ago, where all are larger than allowed.
+    """Remove the least recently used files of a folder if its total size is too large.
 
     Args:
         folder: The folder, whose sub-folders are left alone.
-        most: Bytes of all files; three quarters are left where there are more.
+        most: Largest total size, in bytes; if it is exceeded, files are removed down to three
+            quarters of it.
     """
     try:
         with os.scandir(folder) as entries:
@@ -77,18 +78,18 @@ def bound_folder(folder: Path, most: int) -> None:
                 break
             os.unlink(path)
             total -= status.st_size
-    except OSError:  # another process is at it
+    except OSError:  # another process is removing them
         return
 
 
 def spread_over_cores(batch: int) -> None:
     """Let JAX count the cores of the processor as devices; to be called before JAX is imported.
 
-    Training spreads its batches over devices. One step on two cores so takes about half the time;
-    what XLA itself spreads over cores is little.
+    Training spreads its batches over devices. On two cores a step then takes about half the time;
+    XLA itself spreads little work over cores.
 
     Args:
-        batch: Examples that the devices share; their number divides it.
+        batch: Number of examples that the devices share; the number of devices divides it.
     """
     if "jax" in sys.modules:
         return
@@ -106,11 +107,11 @@ def join_processes(
     """Make this process one of several that compute together; to be called before JAX computes.
 
     Args:
-        coordinator: Address `host:port` at which process 0 listens; None to learn it from a cluster
+        coordinator: Address `host:port` at which process 0 listens; None to get it from a cluster
             that JAX knows, such as Slurm or Open MPI.
         processes: Number of processes; None as for the coordinator.
         process: Number of this process, from 0; None as for the coordinator.
-        patience: Seconds, 1 or more, that a process which is done waits for the others to end.
+        patience: Seconds, 1 or more, that a finished process waits for the others to end.
 
     Raises:
         ValueError: Only some are given, or no cluster is found.
@@ -138,12 +139,12 @@ def join_processes(
 
 
 class Processor(NamedTuple):
-    """The processor of the machine, as the system describes it.
+    """The processor of the machine, as reported by the system.
 
     Attributes:
-        name: Name of the processor, for people.
-        features: The instructions that it knows, such as `avx2`, `avx512f` and `amx_bf16`; empty
-            where the system does not tell.
+        name: Human-readable name of the processor.
+        features: Instruction sets of the processor, such as `avx2`, `avx512f` and `amx_bf16`; empty
+            if the system does not report them.
     """
 
     name: str
@@ -152,7 +153,7 @@ class Processor(NamedTuple):
 
 @cache
 def processor() -> Processor:
-    """The machine's processor, from /proc/cpuinfo where there is one."""
+    """The machine's processor, from /proc/cpuinfo if it exists."""
     info = Path("/proc/cpuinfo")
     first, _, _ = (info.read_text() if info.exists() else "").partition("\n\n")
     lines = (line.split(":", 1) for line in first.splitlines() if ":" in line)
@@ -162,9 +163,9 @@ def processor() -> Processor:
 
 
 def _folder() -> Path | None:
-    """The folder for compiled programs, readable by the user alone; None where there can be none.
+    """The folder for compiled programs, readable only by the user; None if it cannot be made.
 
-    What it holds is run as machine code.
+    Only the user may write to it, because its content is run as machine code.
     """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

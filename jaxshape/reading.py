@@ -1,6 +1,6 @@
-"""Files that others made, read within limits: regular files, JSON, arrays. [host]
+"""Read files from other sources within limits: regular files, JSON, arrays. [host]
 
-What is refused is said in a few words, as the end of a sentence that names the file.
+Messages of refusals are a few words, for the end of a sentence that names the file.
 """
 
 import codecs
@@ -23,7 +23,8 @@ from jaxshape import limits
 def opened(path: str | os.PathLike[str], most: int) -> Iterator[BinaryIO]:
     """Open a file for the block that reads it.
 
-    Pipes are not waited for, nor devices read: a recording or a result may come from anyone.
+    It neither waits for pipes nor reads devices, since a recording or a result may come from
+    anyone.
 
     Args:
         path: The file, or a link to it.
@@ -31,7 +32,7 @@ def opened(path: str | os.PathLike[str], most: int) -> Iterator[BinaryIO]:
 
     Raises:
         OSError: It cannot be opened.
-        ValueError: It is not a regular file, or larger.
+        ValueError: It is not a regular file, or is larger than `most`.
     """
     with open(path, "rb", opener=_at_once) as file:
         status = os.fstat(file.fileno())
@@ -58,7 +59,7 @@ def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:
         most: Largest size, in bytes.
     """
     with opened(path, most) as file:
-        content = file.read(most + 1)  # it may have grown
+        content = file.read(most + 1)  # the file may have grown
     if len(content) > most:
         raise ValueError(f"it has more than {_size(most)}")
     return content
@@ -73,7 +74,7 @@ def read_text(path: str | os.PathLike[str], most: int = limits.TEXT_BYTES) -> st
 
     Raises:
         OSError: It cannot be opened.
-        ValueError: It is neither, not a regular file, or larger.
+        ValueError: It is not in UTF-8 or UTF-16, not a regular file, or larger than `most`.
     """
     content = read_bytes(path, most)
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -99,7 +100,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def read_json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The object that a JSON file holds; raises as `read_json` does, and where it is none.
+    """The object in a JSON file; raises as `read_json` does, and `ValueError` for other content.
 
     Args:
         path: The file.
@@ -130,7 +131,7 @@ def parse_json(text: str) -> Any:
 
 
 def _nesting(text: str) -> int:
-    """The largest number of brackets, outside of quotes, that are open at the same time."""
+    """Depth of nesting of the brackets outside quotes."""
     if text.count("[") + text.count("{") <= limits.JSON_NESTING:
         return 0
     outside = _TEXT.sub("", text).translate(_BRACKETS)
@@ -147,7 +148,7 @@ def numbers_of(value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Numbers from a JSON file as an array.
 
     Args:
-        value: Numbers in lists; a number in a text, a truth and null are none.
+        value: Numbers in lists; numbers in strings, booleans and null are refused.
         shape: Shape to give them; -1 for any length.
 
     Raises:
@@ -166,12 +167,11 @@ def numbers_of(value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
 def read_arrays(
     path: str | os.PathLike[str], names: Iterable[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Arrays of an .npz file; nothing pickled is loaded.
+    """Read arrays of an .npz file; pickled objects are not loaded.
 
     Args:
         path: The file.
-        names: Names of the arrays to read, of which those are left out that are not there; None for
-            all.
+        names: Names of the arrays to read, of which missing ones are left out; None for all.
 
     Raises:
         OSError: The file cannot be opened.
@@ -188,7 +188,7 @@ def read_arrays(
                 return {name: arrays[name] for name in chosen}
         except (MemoryError, KeyboardInterrupt):
             raise
-        except Exception as error:  # zipfile, its decompressors and NumPy fail in a dozen ways
+        except Exception as error:  # zipfile, decompressors and NumPy raise many kinds
             raise ValueError(str(error) or type(error).__name__) from error
 
 
@@ -206,7 +206,7 @@ def array_names(path: str | os.PathLike[str]) -> frozenset[str]:
 
 
 def _sizes(file: BinaryIO) -> dict[str, int]:
-    """The bytes that each array of an .npz file says it has."""
+    """The size in bytes that the header of each array of an .npz file states."""
     with zipfile.ZipFile(file) as archive:
         members = archive.infolist()
         if len(members) > limits.ARRAY_ENTRIES:
