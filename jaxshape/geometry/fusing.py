@@ -153,7 +153,7 @@ def fuse(
     """Fuse all frames of one camera, one at a time, so that memory holds only two fields.
 
     Args:
-        fusing: The way to fuse them.
+        fusing: The fusion method.
         depth: Metres `[frame h w]`; 0 for missing depth, infinite where the ray hit nothing.
         segmented: True on pixels that show the object `[frame h w]`.
         intrinsics: The camera of all frames.
@@ -187,7 +187,7 @@ def fuse_in_stages(
     """The state of the first k frames, for each k of an increasing tuple.
 
     Args:
-        fusing: The way to fuse them.
+        fusing: The fusion method.
         numbers: Increasing numbers of frames, 1 or more each.
         depth: Metres `[frame h w]`; 0 for missing depth, infinite where the ray hit nothing.
         segmented: True on pixels that show the object `[frame h w]`.
