@@ -1,7 +1,7 @@
 """Meshes in folders, zip archives and furniture catalogues, listed without opening a mesh. [host]
 
-Everything is read in memory, through `read_bytes`: nothing is ever unpacked to disk, so a member
-called `../../evil.obj` is only a name, and a member that inflates without end is cut off.
+Everything is read into memory, through `read_bytes`: nothing is unpacked to disk, so that a member
+called `../../evil.obj` is harmless, and a member that inflates without end is cut off.
 """
 
 import os
@@ -26,7 +26,7 @@ UNREAD_SUFFIXES = (
     ".lwo", ".ma", ".max", ".mb", ".rar", ".skp", ".step", ".stp", ".tar", ".tgz", ".usd", ".usda",
     ".usdc", ".usdz", ".vrml", ".wrl", ".x", ".x3d", ".xz",
 )  # fmt: skip
-"""Suffixes of meshes and archives that are not read, and are counted where they are met."""
+"""Suffixes of meshes and archives that are not read; such files are only counted."""
 
 MAX_BYTES = MESH_BYTES
 """Largest file or inflated archive member that is read."""
@@ -44,13 +44,13 @@ class MeshSource(NamedTuple):
 
     Attributes:
         name: Path below the listed root without suffixes, with `/` between folders and no `..`;
-            where two would be equal, each keeps its suffixes. No two of a listing are equal.
+            if two would be equal, each keeps its suffixes. All names of a listing are different.
         path: The file on disk: a mesh, or the archive that holds it.
-        member: Name of the member inside the archive; None for a file of its own.
+        member: Name of the member inside the archive; None for a file that is not in an archive.
         metadata: Entries of a furniture catalogue for the mesh, under the catalogue's own field
             names; empty without a catalogue.
-        axes: Axes of this file that point up and to the front, as ("z", "-y"); None for the axes of
-            its collection.
+        axes: Axes of this file that point up and to the front, such as ("z", "-y"); None for the
+            axes of its collection.
     """
 
     name: str
@@ -65,12 +65,12 @@ class TooLarge(ValueError):
 
 
 def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
-    """List every mesh at a path, in the order of their names, without loading any.
+    """List every mesh at a path, sorted by name, without loading any.
 
-    Folders are searched recursively for meshes and archives, as ShapeNet and ModelNet trees are;
-    symbolic links to folders are not followed, and hidden files are left out (`passed_over` counts
-    what might have been meshes). An archive or a folder that cannot be opened is listed under its
-    own name, so that loading it reports why.
+    Folders, such as the trees of ShapeNet and ModelNet, are searched recursively for meshes and
+    archives. Symbolic links to folders are not followed, and hidden files are left out
+    (`passed_over` counts files that might be meshes). An archive or a folder that cannot be opened
+    is listed under its own name, so that loading it reports the reason.
 
     Args:
         path: A mesh, an archive (`.zip`, or Sweet Home 3D's `.sh3f`), or a folder of both.
@@ -130,10 +130,10 @@ def _walk(folder: Path) -> _Walked:
 
 
 def passed_over(path: str | os.PathLike[str]) -> Counter[str]:
-    """Files that may be meshes but are not read: their number for each suffix.
+    """Number of files, for each suffix, that may be meshes but are not read.
 
     Args:
-        path: A folder; nothing is passed over in a file.
+        path: A folder; for a file, the result is empty.
     """
     if not Path(path).is_dir():
         return Counter()
@@ -156,7 +156,7 @@ def _list_archive(file: Path, prefix: str) -> list[tuple[str, MeshSource]]:
         with zipfile.ZipFile(file) as archive:
             members = archive.namelist()
             catalogue = _catalogue(archive) if _CATALOGUE in members else {}
-    except Exception:  # zipfile and its decompressors raise a dozen kinds on broken archives
+    except Exception:  # zipfile and decompressors raise many kinds on broken archives
         return [(prefix or file.name, MeshSource("", str(file)))]
     return [
         (f"{prefix}/{member}", MeshSource("", str(file), member, catalogue.get(member, {})))
@@ -166,7 +166,7 @@ def _list_archive(file: Path, prefix: str) -> list[tuple[str, MeshSource]]:
 
 
 def _named(found: list[tuple[str, MeshSource]]) -> list[MeshSource]:
-    """Name each source by its path, without suffixes unless another would have the same name."""
+    """Name each source by its path, without suffixes unless this would give two the same name."""
     paths = [printable(_safe(path)) for path, _ in found]
     stems = [re.sub(rf"(?i)({_SUFFIX})(?=/|$)", "", path) for path in paths]
     shared = Counter(stems)
@@ -174,14 +174,13 @@ def _named(found: list[tuple[str, MeshSource]]) -> list[MeshSource]:
     sources = []
     for path, stem, (_, source) in zip(paths, stems, found, strict=True):
         name = stem if shared[stem] == 1 else path
-        seen[name] += 1  # members of one archive may even have equal paths, once made safe
+        seen[name] += 1  # members of one archive may have equal paths after `_safe`
         sources.append(source._replace(name=name if seen[name] == 1 else f"{name}~{seen[name]}"))
     return sorted(sources, key=lambda source: source.name)
 
 
 def printable(name: str) -> str:
-    """A name of a file whose bytes that are no UTF-8 are written as `\\xe9`, so that any text file
-    and any console can hold it.
+    """A file name with bytes that are not UTF-8 written as `\\xe9`, for any file and console.
 
     Args:
         name: A name or path, as Python gives it.
@@ -239,13 +238,13 @@ def read_bytes(source: MeshSource, relative: str | None = None) -> bytes:
     """
     path = Path(source.path)
     if path.is_dir():
-        os.listdir(path)  # says why a folder that was listed cannot be read
+        os.listdir(path)  # raises the reason why a listed folder cannot be read
         raise IsADirectoryError(f"{printable(path.name)!r} could not be opened as a folder.")
     if source.member is None and path.suffix.lower() in ARCHIVE_SUFFIXES:
         raise zipfile.BadZipFile(f"{path.name} is not a readable zip archive.")
     if source.member is None:
         file = path if relative is None else path.parent / _below(relative)
-        if not file.is_file():  # a device or a pipe could be read for ever
+        if not file.is_file():  # reading a device or a pipe might never end
             raise FileNotFoundError(f"There is no file {file.name!r} next to the mesh.")
         with open(file, "rb") as stream:
             return _read(stream.read, file.name)
@@ -258,8 +257,8 @@ def read_bytes(source: MeshSource, relative: str | None = None) -> bytes:
 
 @lru_cache(maxsize=4)
 def _archive(path: str, modified: int, size: int) -> zipfile.ZipFile:
-    """An open archive; listing the members of a large one again for each member takes minutes."""
-    del modified, size  # another file at the same path is opened anew
+    """An open archive, cached: reading its list of members for each member may take minutes."""
+    del modified, size  # a changed file at the same path is opened again
     return zipfile.ZipFile(path)
 
 
@@ -284,8 +283,7 @@ def _read(read: Callable[[int], bytes], name: str) -> bytes:
 
 
 class RelativeFiles(Resolver):
-    """Reads the files that a mesh refers to, such as a glTF file's buffers, but never its
-    pictures."""
+    """Reads the files that a mesh refers to, such as a glTF file's buffers, but no textures."""
 
     def __init__(self, source: MeshSource):
         self._read: Callable[[str], bytes] = lambda name: read_bytes(source, name)

@@ -1,4 +1,4 @@
-"""The oriented box that tells the object from the room."""
+"""The oriented box that separates the object from the room."""
 
 import re
 from pathlib import Path
@@ -12,14 +12,14 @@ from jaxshape.data.sequences import SequenceError, check_rigid
 
 
 class Box(NamedTuple):
-    """An oriented box around the object, less some boxes that hold other things.
+    """An oriented box around the object, minus boxes that hold other things.
 
     Attributes:
         T_world_object: Pose of the object frame `[4 4]`: origin at the centre of the box, +y up,
             front along +z, in metres.
         size: Extents along the axes of the object `[3]`, in metres, above 0.
-        exclude: Lowest and highest corners, in the object frame, of boxes whose points are not the
-            object `[e 2 3]`; empty for none.
+        exclude: Lowest and highest corners `[e 2 3]`, in the object frame, of boxes whose points do
+            not belong to the object; empty if there are none.
     """
 
     T_world_object: Float[np.ndarray, "4 4"]
@@ -64,15 +64,15 @@ def read_box(path: str | Path) -> Box:
     The file holds `{"T_world_object": 4x4, "size": [x, y, z]}` and may hold
     `"exclude": [{"min": [x, y, z], "max": [x, y, z]}, ...]`, as the fields of `Box`. A file with
     `world_to_level` (4x4, to a frame with z up) and `chair_box_level` (`X`, `Y` and `h`, each
-    lowest and highest) is read as a box whose front looks along the level X, since such a file does
-    not name the front; the regions that its `exclude_level` describes, comparisons of X, Y or h
-    with numbers joined by `and`, are excluded.
+    lowest and highest) is read as a box whose front points along the level X, since such a file
+    does not give the front. Its `exclude_level`, comparisons of X, Y or h with numbers joined by
+    `and`, describes regions that are excluded.
 
     Args:
         path: The JSON file.
 
     Raises:
-        SequenceError: The file cannot be read, or is none of these.
+        SequenceError: The file cannot be read, or has neither form.
     """
     try:
         content = reading.read_json(path)
@@ -119,7 +119,7 @@ def _level_box(content: dict[str, Any], path: str | Path) -> Box:
     x, y, height = (_numbers(level, axis, (2,), path) for axis in ("X", "Y", "h"))
     front, _, up = T_level_world[:3, :3]
     T_world_object = np.eye(4)
-    # By a cross product, as the level frame of the known files is left-handed.
+    # A cross product, since the level frame of the known files is left-handed.
     T_world_object[:3, :3] = np.stack([np.cross(up, front), up, front], axis=1)
     center = np.array([x.mean(), y.mean(), height.mean(), 1.0])
     T_world_object[:, 3] = np.linalg.inv(T_level_world) @ center
@@ -128,14 +128,14 @@ def _level_box(content: dict[str, Any], path: str | Path) -> Box:
         return Box(T_world_object, size)
     excluded = _level_rule(str(content["exclude_level"]), path)
     T_object_level = np.linalg.inv(T_world_object) @ np.linalg.inv(T_level_world)
-    # The axes of both frames are parallel, so a box stays one; it may swap its ends.
-    # Far away stands for no limit, as infinity times zero is not a number.
+    # The axes of both frames are parallel, so a box stays a box, though its ends may be exchanged.
+    # A far corner stands for no limit, because infinity times zero is not a number.
     corners = excluded @ T_object_level[:3, :3].T + T_object_level[:3, 3]
     return Box(T_world_object, size, np.sort(corners, axis=0)[None])
 
 
 def _level_frame(content: dict[str, Any], path: str | Path) -> Float[np.ndarray, "4 4"]:
-    """World to level: a rigid motion that may mirror, as it does in the known files."""
+    """World to level: a rigid motion that may include a reflection, as in the known files."""
     T = _numbers(content, "world_to_level", (4, 4), path)
     mirrored = np.diag([1.0, 1.0, np.sign(np.linalg.det(T[:3, :3])) or 1.0, 1.0])
     check_rigid(mirrored @ T, f"world_to_level of {path}")

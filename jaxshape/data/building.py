@@ -1,8 +1,8 @@
-"""Build a dataset, object by object, in processes that may die. [host]
+"""Build a dataset, object by object, in processes that may be killed. [host]
 
-Each object that is made, or skipped, leaves a part in `parts/`: its arrays, and a record that comes
-last. When all objects of a shard are there, their parts become the shard. A killed build so loses
-only the objects it was at.
+Each object that is made, or skipped, leaves a part in `parts/`: its arrays and then, as the last
+file, a record. When all objects of a shard are done, their parts are merged into the shard. A
+killed build therefore loses only the objects in progress.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ class BuildProgress(NamedTuple):
 
     Attributes:
         objects: Objects that are done, skipped ones included.
-        total: Objects in all.
+        total: Total number of objects.
         skipped: Objects that could not be used.
         notes: Names of objects, and notes on other things in their files.
     """
@@ -73,7 +73,7 @@ class Record(NamedTuple):
         name: Its name.
         content: Digest of its file; empty for a procedural object.
         notes: Notes on other things in its file.
-        skipped: Why it could not be used; None where it could.
+        skipped: Why the object could not be used; None if it could.
     """
 
     name: str
@@ -100,11 +100,11 @@ def build_dataset(
         workers: Processes, 1 or more; None for one for each CPU core.
 
     Yields:
-        The progress, at first and after each object.
+        The progress, at the start and after each object.
 
     Raises:
         DatasetError: The folder holds a dataset of other objects or settings.
-        WorkersDied: Processes end before they begin.
+        WorkersDied: Processes end before they begin to work.
     """
     folder = Path(folder)
     _claim(folder, objects, config)
@@ -126,7 +126,7 @@ def build_dataset(
             else:
                 missing.append((number, item))
     yield progress
-    for shard, known in done.items():  # a build may be killed between its last part and its shard
+    for shard, known in done.items():  # a build may have been killed before merging a shard
         if len(known) == len(shards[shard]):
             _write_shard(folder, config, shard, known)
     make = partial(_make_part, folder, config)
@@ -145,14 +145,14 @@ def build_dataset(
 
 
 def content_of(item: Object) -> str:
-    """Digest of the content of an object's file; empty where there is no file, or none to read.
+    """Digest of the content of an object's file; empty if there is no file, or it cannot be read.
 
     Args:
         item: The object.
     """
     try:
         return meshes.digest(item) if isinstance(item, MeshSource) else ""
-    except Exception:  # archives and folders fail in any way there is
+    except Exception:  # archives and folders may raise anything
         return ""
 
 
@@ -218,7 +218,7 @@ def _read_part(folder: Path, number: int) -> Record | None:
 def _write_shard(
     folder: Path, config: DatasetConfig, shard: int, records: dict[int, Record]
 ) -> None:
-    """Put the parts of a shard together, and remove them."""
+    """Merge the parts of a shard, and remove them."""
     numbers = sorted(records)
     made = [number for number in numbers if records[number].skipped is None]
     voxels = config.resolution**3
@@ -230,7 +230,7 @@ def _write_shard(
                 with np.load(_part_path(folder, number, "npz")) as arrays:
                     rows[row] = arrays[kind]
             rows.flush()
-    # The names come last: a shard counts as written once they are there.
+    # The JSON file comes last: with it, a shard counts as written.
     content = {
         "names": [records[number].name for number in made],
         "skipped": [records[number].skipped for number in numbers if records[number].skipped],
@@ -242,7 +242,7 @@ def _write_shard(
 
 
 def _remove_parts(folder: Path, numbers: Iterable[int]) -> None:
-    """Remove what a shard now holds; a build may be killed while it does so."""
+    """Remove parts that a shard now holds; this also works after an interrupted removal."""
     if not (folder / "parts").is_dir():
         return
     for number in numbers:
@@ -255,12 +255,12 @@ def _remove_parts(folder: Path, numbers: Iterable[int]) -> None:
 def _finished(
     folder: Path, shard: int, items: Sequence[Object]
 ) -> tuple[list[Skipped], list[tuple[str, str]]] | None:
-    """The skipped objects and the notes of a shard; None where it has to be made."""
+    """The skipped objects and the notes of a shard; None if the shard has to be made."""
     path = shard_path(folder, shard, "json")
     if not path.exists():
         return None
     found = json.loads(path.read_text())
-    contents = found.get("contents", [""] * len(items))  # datasets of before there were contents
+    contents = found.get("contents", [""] * len(items))  # old datasets have no contents
     if any(content not in ("", content_of(item))
            for content, item in zip(contents, items, strict=True)):  # fmt: skip
         path.unlink()

@@ -1,6 +1,6 @@
-"""Settings of how an object is seen: by which depth camera, and how its frames are fused.
+"""Settings of the depth camera that films an object, and of the fusion of its frames.
 
-Nothing here imports JAX, so that the command line answers at once.
+Nothing here imports JAX, so that the command line starts quickly.
 """
 
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from jaxshape.geometry.config import FusionName
 
 @dataclass(frozen=True, kw_only=True)
 class CameraConfig:
-    """A virtual depth camera, and how its frames are fused.
+    """A virtual depth camera, and the fusion of its frames.
 
     Attributes:
         camera: The depth camera: the first Kinect (640 x 480 pixels), an Intel RealSense, the LiDAR
             of an iPhone (256 x 192), or the paper's square images of 96 pixels.
-        noise: Give depth images the faults of the camera's sensor; None for all but the paper's
-            camera.
+        noise: Give depth images the faults of the camera's sensor; None does so for all cameras
+            except the paper's.
         fusion: Method that turns frames into F and M: `distance` averages signed distances on a
-            fine grid, `points` counts points in voxels (paper); None for points where the paper's
-            camera has no noise, distances elsewhere.
+            fine grid, `points` counts points in voxels (paper); None selects points for the paper's
+            camera without noise, and distances otherwise.
 
     Raises:
-        ValueError: A setting is none of these.
+        ValueError: A setting has another value.
     """
 
     camera: CameraName = "kinect"

@@ -1,4 +1,4 @@
-"""One object seen by the virtual camera: depth frames, measurements, ground truth. [host]"""
+"""Film one object with a virtual camera: depth frames, measurements, ground truth. [host]"""
 
 import math
 from collections.abc import Iterator
@@ -29,15 +29,15 @@ SURFACE_SAMPLES = 50_000
 PAPER = CAMERAS["paper"]
 
 GRID_MARGIN = grid.RESOLUTION / (grid.RESOLUTION - 2 * grid.MARGIN) - 1
-"""By how much the object's grid is larger than the object, as a share of its size."""
+"""Margin of the object's grid around the object, as a share of the object's size."""
 
 
 class Capture(NamedTuple):
     """Depth frames of an object from known poses, and its true surface.
 
     Attributes:
-        depth: Depth images `[views h w]`, in metres; 0 where nothing is known, infinite where the
-            ray met nothing.
+        depth: Depth images `[views h w]`, in metres; 0 for missing depth, infinite where the ray
+            hit nothing.
         intrinsics: The camera of all frames.
         T_object_camera: Pose of each frame in the object frame `[views]`.
         frame: Voxel frame of the object's grids.
@@ -61,19 +61,19 @@ def capture(
     camera: VirtualCamera = PAPER,
     resolution: int = grid.RESOLUTION,
 ) -> Capture:
-    """Look at a mesh from some poses, and find its surface voxels (paper, section 2.3). [host]
+    """Film a mesh from given poses, and find its surface voxels (paper, section 2.3). [host]
 
-    The ground truth comes straight from points on the CAD model, not through the depth frames, so
-    that it is complete.
+    The ground truth is computed from points on the CAD model, not from the depth frames, so that it
+    is complete.
 
     Args:
         mesh: A mesh in the canonical object frame: +y up, front along +z, box centred at the
             origin, in metres.
-        T_object_camera: Poses of the camera `[views]`; `camera_distance` says how far away it
-            stands.
+        T_object_camera: Poses of the camera `[views]`, usually at the distance `camera_distance`.
         noise: Whether the images have the faults of the camera's sensor.
         seed: Seed of the noise and of the surface samples, 0 or more.
-        camera: The depth camera. The window of its images that can show the object's grid is kept.
+        camera: The depth camera. Only the window of its images that can show the object's grid is
+            kept.
         resolution: Voxels along each axis of the object's grids.
 
     Returns:
@@ -105,7 +105,7 @@ def true_surface(
 
 
 def camera_distance(mesh: trimesh.Trimesh, camera: VirtualCamera = PAPER) -> float:
-    """Distance at which a virtual camera stands from the object's centre, in metres.
+    """Distance of a virtual camera from the object's centre, in metres.
 
     Args:
         mesh: The object, in metres.
@@ -127,7 +127,7 @@ def discretize(
 
 @jax.jit
 def measure_frames(captured: Capture) -> Measurement:
-    """Measure each frame of a capture on its own; every pixel that hit something shows the object.
+    """Measure each frame of a capture alone; every pixel that hit something shows the object.
 
     Compiled by `jax.jit`.
 
@@ -169,7 +169,7 @@ def fused_grids(
 
     Args:
         captured: Depth frames of an object, from `capture`.
-        fusing: The way to fuse them.
+        fusing: The fusion method.
         numbers: Increasing numbers of frames, 1 or more each.
         sensor: Noise of the camera (`sensor_of`); the first Kinect's by default.
 
@@ -195,7 +195,7 @@ def fused_frames(captured: Capture, fusing: Fusion, sensor: Sensor = Sensor()) -
 
     Args:
         captured: Depth frames of an object, from `capture`.
-        fusing: The way to fuse them.
+        fusing: The fusion method.
         sensor: Noise of the camera (`sensor_of`); the first Kinect's by default.
     """
     (state,) = _stages(captured, fusing, (len(captured.depth),), sensor)

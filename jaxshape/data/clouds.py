@@ -17,19 +17,19 @@ from jaxshape.data.pcd import parse_pcd
 SUFFIXES = (".ply", ".pcd")
 
 MAX_POINTS = 200_000
-"""Points that are kept; of more, as many are drawn."""
+"""Largest number of points; of larger clouds, this number is drawn."""
 
 FEWEST = 100
-"""Points below which there is no shape to complete."""
+"""Smallest number of points that can be completed."""
 
 
 class Cloud(NamedTuple):
-    """Points on the surface of one object, in a frame and a unit of their own.
+    """Points on the surface of one object, in the frame and the unit of their file.
 
     Attributes:
         points: The points `[n 3]`.
-        normals: Directions out of the surface `[n 3]`, of length 1; None where they are not known.
-        sensor: Position of the sensor that saw all points `[3]`; None where that is not known.
+        normals: Outward normals `[n 3]`, of length 1; None if they are not known.
+        sensor: Position of the sensor that measured all points `[3]`; None if it is not known.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -40,7 +40,7 @@ class Cloud(NamedTuple):
 def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
     """Read a point cloud or a fused model.
 
-    A model of triangles gives points all over its surface, with its normals. Points that are not
+    For a triangle mesh, points are sampled over its surface, with its normals. Points that are not
     finite are left out; all normals are dropped if one of them has no length.
 
     Args:
@@ -48,7 +48,7 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
         seed: Seed of the draw of points, 0 or more.
 
     Returns:
-        Up to `MAX_POINTS` points, with their normals and the sensor's position where the file has
+        Up to `MAX_POINTS` points, with their normals and the sensor's position if the file has
         them.
 
     Raises:
@@ -61,7 +61,7 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
     try:
         content = read_bytes(MeshSource(path.stem, str(path)))
         found = _read_ply(content, path, seed) if kind == ".ply" else _read_pcd(content)
-    except Exception as error:  # parsers of foreign files fail in any way there is
+    except Exception as error:  # parsers of foreign files may raise anything
         reason = " ".join(f"{error or type(error).__name__}".split())[:300]
         raise ValueError(
             f"{path} cannot be read as a point cloud ({reason}); expected a whole PLY or PCD file: "
@@ -112,7 +112,7 @@ def _read_pcd(content: bytes) -> Cloud:
 
 
 def _normals_of(columns: Any, count: int) -> Float[np.ndarray, "n 3"] | None:
-    """Normals from fields of the names that PLY (nx) or PCD (normal_x) give them."""
+    """Normals from fields with the names of PLY (nx) or PCD (normal_x)."""
     names = getattr(getattr(columns, "dtype", None), "names", None) or tuple(columns)
     for pattern in ("n{}", "normal_{}"):
         wanted = [pattern.format(axis) for axis in "xyz"]

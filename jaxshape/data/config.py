@@ -1,6 +1,6 @@
 """Settings of a dataset and of the inputs drawn from it.
 
-Nothing here imports JAX, so that the command line answers at once.
+Nothing here imports JAX, so that the command line starts quickly.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from jaxshape import checks, limits
 
 CameraName = Literal["paper", "kinect", "realsense", "iphone-lidar"]
-"""Depth cameras that a virtual one can stand for (`data/virtual_cameras`)."""
+"""Depth cameras that can be simulated (`data/virtual_cameras`)."""
 
 FamilyName = Literal["chair", "table"]
 """Families of procedural objects (`data/families`), and weights of the same names."""
@@ -31,10 +31,10 @@ def check_axes(up: str, front: str) -> None:
 
     Args:
         up: Axis that points up, as "y" or "-z".
-        front: Axis along which the object's front looks.
+        front: Axis towards which the object faces.
 
     Raises:
-        ValueError: An argument is no axis, or both lie on one line.
+        ValueError: An argument is not an axis, or both are on one line.
     """
     checks.one_of("up", up, get_args(Axis))
     checks.one_of("front", front, get_args(Axis))
@@ -50,12 +50,12 @@ class FaultConfig:
 
     Attributes:
         pose_error: Share of the frames whose pose is off by about a centimetre and half a degree.
-        missing: Share of the frames that lack a region, as where a sensor returns nothing.
-        segmentation: Share of the frames whose mask is wrong: it cuts a piece off, or takes in some
-            floor.
-        hidden: Share of the paths along which something hides one side of the object in all frames.
-        loose: Share of the paths along which the object's box is up to 6 % too large on each side,
-            and with it the object smaller along each axis by a factor of its own.
+        missing: Share of the frames that lack a region, as if the sensor returned nothing there.
+        segmentation: Share of the frames whose mask is wrong: it lacks a piece of the object, or
+            includes some floor.
+        hidden: Share of the paths in which something hides one side of the object in all frames.
+        loose: Share of the paths in which the object's box is up to 6 % too large on each side, so
+            that the object is smaller in the grid, by a different factor along each axis.
 
     Raises:
         ValueError: A share is outside its range.
@@ -77,24 +77,24 @@ FAULTLESS = FaultConfig(0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """Settings that decide, with the objects themselves, every byte of a dataset.
+    """Settings that, together with the objects, determine every byte of a dataset.
 
     The defaults are the preset `default`.
 
     Attributes:
-        paths: Camera paths about each object, 1 or more. Each draws its own camera, views, noise
+        paths: Camera paths around each object, 1 or more. Each draws its own camera, views, noise
             and faults.
         frames: Increasing numbers of frames, 1 or more each: the measurement after each number of
             frames of a path becomes a training input.
-        cameras: Names of the depth cameras of which each path draws one: "paper", "kinect",
+        cameras: Names of the depth cameras, from which each path draws one: "paper", "kinect",
             "realsense", "iphone-lidar". Frames of the paper's camera are fused as points, others as
             signed distances.
         noisy: Share of the paths whose depth images get the faults of their sensor, from 0 to 1.
-        arcs: Share of the paths along an arc about the object, from 0 to 1; the others draw random
+        arcs: Share of the paths along an arc around the object, from 0 to 1; the others draw random
             views as in the paper.
         faults: Rates of the faults of real frames.
         up: Axis of the mesh files that points up.
-        front: Axis of the mesh files along which the object's front looks.
+        front: Axis of the mesh files towards which the object faces.
         unit: Unit of the mesh files: "m", "cm", "mm" or "inch".
         resolution: Voxels along each axis of the grids: 8, 16, 32, 64 or 128 (paper: 32).
         seed: Seed of all draws, 0 or more.
@@ -135,7 +135,7 @@ class DatasetConfig:
 
 DATASETS = {
     "default": DatasetConfig(),
-    # 18 clean random views of each object, each a measurement of its own (section 2.3).
+    # 18 clean random views of each object, each a separate measurement (section 2.3).
     "paper": DatasetConfig(
         paths=18, frames=(1,), cameras=("paper",), noisy=0.0, arcs=0.0, faults=FAULTLESS
     ),
@@ -145,13 +145,13 @@ DATASETS = {
 
 @dataclass(frozen=True)
 class InputConfig:
-    """Settings by which training inputs are drawn from a dataset.
+    """Settings for drawing training inputs from a dataset.
 
     Attributes:
         complete: Share of the inputs that are the complete surface itself, from 0 to 1.
         mirror: Exchange left and right in half of the pairs.
-        warp: Each axis is stretched and squeezed along its length by up to this share, from 0 to
-            below 1: more proportions from the same objects.
+        warp: Each axis is locally stretched and compressed by up to this share, from 0 to below 1:
+            it gives more proportions from the same objects.
 
     Raises:
         ValueError: A setting is outside its range.

@@ -30,12 +30,12 @@ from jaxshape.geometry.grids import Grids
 FORMAT = "jaxshape-dataset-2"
 
 KINDS = ("surface", "measured")
-"""Arrays of a shard, each in a file of its own."""
+"""Arrays of a shard, each in a separate file."""
 
 OBJECTS_PER_SHARD = 64
 
 STEPS = 15
-"""Steps of the measured probabilities, which have 4 bits each."""
+"""Quantisation steps of the measured probabilities, which have 4 bits each."""
 
 ATTEMPTS = 3
 """Number of times that a path is drawn if nothing is measured along it."""
@@ -63,7 +63,7 @@ def load_object(
 def object_paths(
     mesh: trimesh.Trimesh, config: DatasetConfig, seed: int
 ) -> tuple[UInt8[np.ndarray, "path bytes"], UInt8[np.ndarray, "path number voxels"]] | None:
-    """The complete surface and the measurements of one object along each path, packed; None where a
+    """The complete surface and the measurements of one object along each path, packed; None if a
     camera measures nothing along a whole path in `ATTEMPTS` draws."""
     drawn = [_drawn(mesh, config, (seed, i)) for i in range(config.paths)]
     paths = [path for path in drawn if path is not None]
@@ -78,7 +78,7 @@ def _drawn(
     for attempt in range(ATTEMPTS):
         path = draw_path(mesh, config, hash_seed(*seed, *[attempt] * (attempt > 0)))
         measured = pack_measured(jax.device_get(path.measured))
-        if (measured[-1] > STEPS).any():  # after all its frames, some voxel may be surface
+        if (measured[-1] > STEPS).any():  # after all frames, some voxel may be surface
             return np.asarray(path.surface), measured
     return None
 
@@ -117,7 +117,7 @@ def _side(packed: UInt8[np.ndarray, "*batch bytes"]) -> int:
 
 
 def hash_seed(*numbers: int) -> int:
-    """A seed below 2^31 for each tuple of numbers, unrelated between neighbours."""
+    """A seed below 2^31 from a tuple of numbers; similar tuples give unrelated seeds."""
     return int(np.random.SeedSequence(numbers).generate_state(1)[0] >> 1)
 
 
@@ -136,13 +136,13 @@ def shard_path(folder: Path, number: int, suffix: str) -> Path:
 
 
 class Dataset(NamedTuple):
-    """Objects of a dataset folder, left on disk until they are asked for.
+    """Objects of a dataset folder; they stay on disk until they are requested.
 
     Attributes:
         names: Names of the objects.
         surfaces: Memory-mapped complete surfaces of each shard `[object path bytes]`, packed.
         measured: Memory-mapped measurements of each shard `[object path number voxels]`, packed.
-        row: Shard, and place in it, of each object.
+        row: Shard of each object, and its row in the shard.
     """
 
     names: list[str]
@@ -165,7 +165,7 @@ class Dataset(NamedTuple):
         return self.measured[self.row[index][0]].shape[1:3]
 
     def grids(self, index: int, path: int, number: int) -> Grids:
-        """Soft F and M of an object after one of the numbers of frames of one of its paths."""
+        """Soft F and M of an object along one of its paths; `number` is an index of `frames`."""
         shard, place = self.row[index]
         return unpack_measured(self.measured[shard][place, path, number])
 
@@ -228,7 +228,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _mapped(path: Path, count: int) -> np.ndarray:
-    """The array of a shard of so many objects, left on disk."""
+    """Memory-map the array of a shard of `count` objects."""
     try:
         array = np.load(path, mmap_mode="r")
     except (OSError, ValueError) as problem:

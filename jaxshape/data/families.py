@@ -16,7 +16,7 @@ TEST_SEEDS = 1_000_000
 
 
 class Procedural(NamedTuple):
-    """A procedural object, not yet made.
+    """A procedural object that is not made yet.
 
     Attributes:
         family: Name of its family: "chair", "table".

@@ -1,6 +1,6 @@
-"""Faults of real depth frames, for training: each in its share of the frames. [host]
+"""Faults of real depth frames, for training: each occurs in a share of the frames. [host]
 
-They act on images and poses, as in a recording, so that every way of fusing frames meets them.
+They act on images and poses, as in a recording, so that they affect every fusion method.
 """
 
 from typing import NamedTuple
@@ -18,12 +18,12 @@ POSE_ERROR = 0.01, 0.01
 
 
 class Frames(NamedTuple):
-    """Depth frames as a program meets them.
+    """Depth frames as a program receives them.
 
     Attributes:
-        depth: Metres `[frame h w]`; 0 where nothing is known, infinite where the ray met nothing.
-        segmented: True on pixels that are taken for the object `[frame h w]`.
-        T_object_camera: Poses `[frame]`, as far as they are known.
+        depth: Metres `[frame h w]`; 0 for missing depth, infinite where the ray hit nothing.
+        segmented: True on pixels that are segmented as the object `[frame h w]`.
+        T_object_camera: Poses `[frame]`, of which some may be wrong.
     """
 
     depth: Float[np.ndarray, "frame h w"]
@@ -42,7 +42,7 @@ def with_faults(
     """The frames of an object with the faults of real ones.
 
     Args:
-        depth: Metres `[frame h w]`, infinite where the ray met nothing.
+        depth: Metres `[frame h w]`, infinite where the ray hit nothing.
         intrinsics: The camera of all frames.
         T_object_camera: True poses `[frame]`.
         size: Edges of the object's box, which is centred at the origin, in metres.
@@ -74,7 +74,7 @@ def pixel_rays(intrinsics: Intrinsics, shape: tuple[int, int]) -> Float[np.ndarr
 
 
 def _hide(depth, segmented, rays, poses, size, rng) -> None:
-    """Something stands before one side of the object in all frames: nothing is known there."""
+    """Hide one side of the object in all frames: its depth is missing there."""
     normal = rng.normal(size=3)
     normal /= np.linalg.norm(normal)
     reach = 0.5 * np.abs(normal) @ size
@@ -88,7 +88,7 @@ def _hide(depth, segmented, rays, poses, size, rng) -> None:
 
 
 def _cut(segmented, rng) -> None:
-    """The mask lacks up to a quarter of the object on one side of the image."""
+    """Cut up to a quarter of the object off the mask, on one side of the image."""
     lines = np.flatnonzero(segmented.any(axis=(axis := int(rng.integers(2)))))
     if len(lines) == 0:
         return
@@ -98,7 +98,7 @@ def _cut(segmented, rng) -> None:
 
 
 def _leak(depth, segmented, rays, pose, size, rng) -> None:
-    """The mask takes in a patch of the floor that the object stands on."""
+    """Add a patch of the floor below the object to the mask."""
     directions = rays @ pose[:3, :3].T
     falls = np.where(directions[..., 1] < -1e-6, directions[..., 1], -1e-6)
     along = (-size[1] / 2 - pose[1, 3]) / falls
@@ -111,7 +111,7 @@ def _leak(depth, segmented, rays, pose, size, rng) -> None:
 
 
 def _miss(depth, segmented, rng) -> None:
-    """The sensor returns nothing in a disc of the image around a pixel of the object."""
+    """Remove the depth in a disc of the image around a pixel of the object."""
     rows, columns = np.nonzero(segmented)
     if len(rows) == 0:
         return
@@ -123,7 +123,7 @@ def _miss(depth, segmented, rng) -> None:
 
 
 def _moved(T: jaxlie.SE3, struck: Bool[np.ndarray, " frame"], rng) -> jaxlie.SE3:
-    """Poses of which some are wrong by a normally distributed motion."""
+    """Change some poses by a normally distributed motion."""
     scale = np.repeat(POSE_ERROR, 3) * struck[:, None]
     turn = rng.normal(size=(len(struck), 6)) * scale
     return jaxlie.SE3(T.wxyz_xyz) @ jaxlie.SE3.exp(jnp.float32(turn))

@@ -15,14 +15,14 @@ _SHADOW = re.compile(r"shadow(?!box)", re.I)
 _GROUND = re.compile(r"^(ground|floor|backdrop)([ _-]?plane)?([ _.-]?\d+)?$", re.I)
 
 _WIDER = 1.05
-"""A plane below the object is its ground where it is so much wider along both sides."""
+"""Factor by which a plane below the object is wider, along both sides, if it is the ground."""
 
 _THIN = 1e-3
 """Thickness of a plane, as a share of its width."""
 
 
 def without_helpers(parts: Sequence[Part], up: str = "y") -> tuple[list[Part], tuple[str, ...]]:
-    """The parts that are the object, and a sentence on each kind of the others.
+    """The parts that belong to the object, and a sentence on each kind of other parts.
 
     Args:
         parts: All parts of a file.
@@ -54,7 +54,7 @@ def _is_named(part: Part, named: re.Pattern[str]) -> bool:
 
 
 def _lies_below(part: Part, parts: Sequence[Part], up: str) -> bool:
-    """Whether a part is a level plane under all others, and wider than they are."""
+    """Whether a part is a horizontal plane below all others, and wider than they are."""
     others = [other.vertices[np.unique(other.faces)] for other in parts if other is not part]
     if not others:
         return False

@@ -1,4 +1,4 @@
-"""Training pairs as a reconstruction would meet them. [host]"""
+"""Draw training pairs like the inputs of a reconstruction. [host]"""
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -8,7 +8,7 @@ from jaxshape.data.dataset import Dataset
 from jaxshape.geometry.grids import Grids
 
 KNOTS = 5
-"""Places along an axis between which its stretch changes evenly."""
+"""Number of points along an axis between which its stretch is interpolated linearly."""
 
 
 def draw_pair(
@@ -42,10 +42,10 @@ def draw_pair(
 def warped(
     grids: Grids, surface: Bool[np.ndarray, "x y z"], share: float, rng: np.random.Generator
 ) -> tuple[Grids, Bool[np.ndarray, "x y z"]]:
-    """The pair with other proportions: each axis by a random map that keeps both of its ends.
+    """Change the proportions of a pair: a random map of each axis that keeps both ends.
 
-    Where several layers become one, a voxel is surface if it was in any of them, and free if it was
-    in all, so that no surface gets holes.
+    If several layers become one, a voxel is surface if it was surface in any of them, and free if
+    it was free in all of them, so that no surface gets holes.
     """
     known = 1 - grids.occluded
     seen, free = grids.occupied * known, (1 - grids.occupied) * known
@@ -61,8 +61,8 @@ def warped(
 def source_layers(count: int, share: float, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
     """The first source layer of each new layer, by steps of 1 plus or minus `share`.
 
-    `reduceat` takes the layers up to the next entry, or the layer itself where the next is the
-    same.
+    `reduceat` takes the layers up to the next entry, or only the layer itself if the next entry is
+    equal.
     """
     steps = np.interp(
         np.arange(count), np.linspace(0, count - 1, KNOTS), rng.uniform(1 - share, 1 + share, KNOTS)

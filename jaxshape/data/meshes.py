@@ -1,9 +1,10 @@
 """CAD meshes in the canonical object frame, read from files, folders, archives and catalogues.
 
-    for model in read_meshes("chairs/"):       # Model or Skipped, in the order of their names
+    for model in read_meshes("chairs/"):       # Model or Skipped, sorted by name
         ...
 
-`list_meshes` finds them without opening any, `load` opens one, so that processes can share them.
+`list_meshes` finds meshes without opening any, and `load` opens one, so that processes can share
+the work.
 """
 
 import hashlib
@@ -34,7 +35,7 @@ FLAT = 1e-6
 
 
 SMALLEST, LARGEST = 0.05, 10.0
-"""Diagonals, in metres, between which an object's size is believed."""
+"""Range of plausible diagonals of an object, in metres."""
 
 
 class Model(NamedTuple):
@@ -43,8 +44,8 @@ class Model(NamedTuple):
     Attributes:
         name: Stable identifier: the path below the root that was read, without suffix.
         mesh: Triangles only, +y up, front along +z, bounding box centred at the origin, in the
-            units of the file (metres where the file is in metres, as glTF is, or where a catalogue
-            gives sizes).
+            units of the file (metres if the file is in metres, like glTF, or if a catalogue gives
+            sizes).
         metadata: Entries of a furniture catalogue: name, creator, license, and so on; empty without
             a catalogue.
         notes: Sentences on parts of the file that are not the object and were left out.
@@ -82,7 +83,7 @@ class _Unusable(ValueError):
 def read_meshes(
     path: str | os.PathLike[str], *, up: str = "y", front: str = "z", unit: UnitName = "m"
 ) -> Iterator[Model | Skipped]:
-    """Load every mesh at a path in turn, in the order of their names. [host]
+    """Load every mesh at a path in turn, sorted by name. [host]
 
     Args:
         path: A mesh, an archive (`.zip`, or Sweet Home 3D's `.sh3f`), or a folder of both, searched
@@ -92,7 +93,7 @@ def read_meshes(
         unit: Unit of the files: "m", "cm", "mm" or "inch".
 
     Returns:
-        An iterator over the meshes: a `Model`, or `Skipped` where one cannot be used.
+        An iterator over the meshes: a `Model`, or `Skipped` if the mesh cannot be used.
 
     Raises:
         FileNotFoundError: There is nothing at the path.
@@ -108,13 +109,13 @@ def load(
 ) -> Model | Skipped:
     """Load one mesh, flattened and turned so that `up` becomes +y and `front` becomes +z. [host]
 
-    Materials, pictures and parts that are not the object (`helpers`) are left out. Where a
-    furniture catalogue describes the mesh, its rotation and its size in centimetres are applied
-    first, as Sweet Home 3D does.
+    Materials, textures and parts that are not the object (`helpers`) are left out. If a furniture
+    catalogue describes the mesh, its rotation and its size in centimetres are applied first, as in
+    Sweet Home 3D.
 
     Args:
         source: The mesh, from `jaxshape.data.archives.list_meshes`.
-        up: Axis of the file that points up, unless the source says it: `x`, `y`, `z`, or one of
+        up: Axis of the file that points up, unless the source gives it: `x`, `y`, `z`, or one of
             these with a minus.
         front: Axis of the file along which the object's front looks, perpendicular to `up`.
         unit: Unit of the file: "m", "cm", "mm" or "inch".
@@ -142,7 +143,7 @@ def load(
         return Skipped(source.name, "not supported", str(problem))
     except Unreadable as problem:
         return Skipped(source.name, "unreadable", str(problem))
-    except Exception as problem:  # parsers of foreign files fail in any way there is
+    except Exception as problem:  # parsers of foreign files may raise anything
         detail = " ".join(f"{type(problem).__name__}: {problem}".split())
         return Skipped(source.name, "unreadable", detail[:300])
 
@@ -165,7 +166,7 @@ def _parse(source: MeshSource, up: str) -> tuple[trimesh.Trimesh, tuple[str, ...
 
 
 def _usable(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
-    """The triangles that have a finite, nonzero area, and how many have none that is finite.
+    """The triangles with a finite, nonzero area, and a note on those with corners not finite.
 
     Raises:
         _Unusable: Nothing is left, or it has no extent along an axis.
@@ -192,8 +193,7 @@ def _usable(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
 
 
 def digest(source: MeshSource) -> str:
-    """A digest of everything that decides the shape in a file, but not of the file's name and
-    place.
+    """A digest of everything in a file that determines the shape; name and folder do not count.
 
     Args:
         source: The mesh. Files that it refers to and that are missing count as empty.
@@ -209,7 +209,7 @@ def digest(source: MeshSource) -> str:
 
 
 def _apply_catalogue(mesh: trimesh.Trimesh, metadata: dict[str, str]) -> None:
-    """Turn and scale a catalogue's model: +y up, front +z, `width` x `height` x `depth` cm."""
+    """Rotate and scale a catalogue's model: +y up, front +z, `width` x `height` x `depth` cm."""
     if "modelRotation" in metadata:
         rotation = np.array(metadata["modelRotation"].split(), float).reshape(3, 3)
         mesh.vertices = mesh.vertices @ rotation.T
@@ -219,8 +219,7 @@ def _apply_catalogue(mesh: trimesh.Trimesh, metadata: dict[str, str]) -> None:
 
 
 def canonical(mesh: trimesh.Trimesh, *, up: str = "y", front: str = "z") -> trimesh.Trimesh:
-    """Turn a mesh so that `up` becomes +y and `front` +z, and centre its bounding box; the scale is
-    kept.
+    """Rotate a mesh so that `up` becomes +y and `front` +z, and centre its box, at the same scale.
 
     Args:
         mesh: The mesh.
@@ -237,7 +236,7 @@ def canonical(mesh: trimesh.Trimesh, *, up: str = "y", front: str = "z") -> trim
 
 
 def in_metres(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh, at a size at which a depth camera can see it.
+    """The mesh, at a size that a depth camera can film.
 
     Many files are in millimetres, inches or no unit at all, and the noise of a depth camera grows
     with the square of the distance in metres.
@@ -246,8 +245,8 @@ def in_metres(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         mesh: A mesh in any unit, its box centred at the origin.
 
     Returns:
-        The mesh itself if its diagonal in metres fits something in a room; otherwise the mesh
-        scaled to a diagonal of 1 m.
+        The mesh itself if its diagonal in metres is plausible for an object in a room; otherwise
+        the mesh scaled to a diagonal of 1 m.
     """
     if SMALLEST <= mesh.scale <= LARGEST:
         return mesh
@@ -263,10 +262,10 @@ def axes_to_canonical(up: str, front: str) -> Float[np.ndarray, "3 3"]:
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
-    """Sample points on the surface, uniform in area, the same for the same seed.
+    """Sample points on the surface, uniformly in area; the same seed gives the same points.
 
-    The area is cut into equal strata with one point in each, so that every part with at least two
-    points' worth of area is hit, however thin.
+    The area is divided into equal strata with one point in each, so that every part whose area is
+    at least that of two points is hit, however thin it is.
 
     Args:
         mesh: The mesh.
@@ -301,17 +300,18 @@ def sample_oriented(
 def lying_on_its_side(mesh: trimesh.Trimesh) -> bool:
     """Return whether a seat in the canonical frame seems to lie on its side or upside down.
 
-    A heuristic for seats alone. On 78 upright seats it raised no false alarm, on upright chairs
-    made of boxes 2 in 100; turned on their sides, backs, fronts or heads, it knew 8 to 10 of 10.
-    So believe it of a set of meshes, by majority; stools and poufs look much the same either way.
+    This is a heuristic for seats only. It raised no false alarm on 78 upright seats, and 2 in 100
+    on upright chairs made of boxes. Of seats turned on their sides, backs, fronts or heads, it
+    recognised 8 to 10 of 10. So trust only its majority over a set of meshes; stools and poufs look
+    much the same either way.
     """
     return apparent_up(sample_surface(mesh, 6000, seed=0)) != "y"
 
 
 def resembles_a_seat(mesh: trimesh.Trimesh) -> bool:
-    """Whether a mesh stands in one of the directions along its axes as seats and tables do.
+    """Whether a mesh stands like a seat or a table in one of the directions along its axes.
 
     Args:
-        mesh: The mesh, however it lies.
+        mesh: The mesh, in any orientation.
     """
     return max(up_scores(sample_surface(mesh, 6000, seed=0)).values()) > SEAT

@@ -16,18 +16,18 @@ MARGIN = 0.35
 the one that came closest to a false alarm reached 0.28."""
 
 SEAT = 1.1
-"""Score that every seat reaches in its best direction: of 26 real ones, the lowest has 1.18; a box
-has 0.9, a cylinder 0.8."""
+"""Score that every seat reaches in its best direction: the lowest of 26 real seats has 1.18, a box
+0.9, and a cylinder 0.8."""
 
 CELLS = 16
-"""Cells along each axis of the grid that tells level surfaces; the outermost are contact."""
+"""Cells along each axis of the grid that detects level surfaces; the outermost are contact."""
 
 
 def apparent_up(points: Float[np.ndarray, "n 3"]) -> str:
-    """Return the axis of a seat that seems to point up: `y` unless another is clearly likelier, or
-    this is no seat.
+    """The axis of a seat that seems to point up: `y`, unless another one is clearly more probable.
 
-    `points` are some thousands, even over the surface.
+    For a mesh that is not a seat, the result is `y`. `points` are some thousands, spread evenly
+    over the surface.
     """
     scores = up_scores(points)
     best = max(scores, key=lambda direction: scores[direction])
@@ -35,7 +35,7 @@ def apparent_up(points: Float[np.ndarray, "n 3"]) -> str:
 
 
 def up_scores(points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
-    """Score each of `DIRECTIONS` as the up direction; only the differences mean anything."""
+    """Score each of `DIRECTIONS` as the up direction; only differences of scores have a meaning."""
     extents = np.ptp(points, axis=0)
     unit = (points - points.min(axis=0)) / extents
     occupied = np.zeros((CELLS,) * 3, bool)
@@ -51,7 +51,7 @@ def up_scores(points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
         stance_below = _spread(across, height < 0.05) - 0.5 * layers[0]
         stance_above = _spread(across, height > 0.95) - 0.5 * layers[-1]
         level = layers.max() - 0.5 * abs((np.argmax(layers) + 0.5) / CELLS - 0.45)
-        # any seat is asymmetric beyond 0.06 of its size one way or other: more says nothing
+        # every seat is asymmetric beyond 0.06 of its size along some axis: more is no evidence
         score = 0.5 * (stance_below - stance_above) + level + 15 * min(asymmetry[axis], 0.06)
         scores[direction] = float(score)
     return scores
@@ -60,7 +60,7 @@ def up_scores(points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
 def _asymmetry(
     unit: Float[np.ndarray, "n 3"], extents: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Mean distance to the shape from its mirror image along each axis, over its diagonal."""
+    """Mean distance of the mirror image along each axis to the shape, over the shape's diagonal."""
     points = (unit - 0.5) * extents
     tree = KDTree(points)
     distance = [tree.query(points * mirror)[0].mean() for mirror in 1 - 2 * np.eye(3)]

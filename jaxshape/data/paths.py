@@ -1,6 +1,6 @@
-"""One training path: a camera moves about an object, and its frames are fused as they come. [host]
+"""One training path: a camera moves around an object, and its frames are fused in order. [host]
 
-Each path draws its own camera, poses, noise and faults. The measurements after some numbers of
+Each path draws its own camera, poses, noise and faults. The measurements after certain numbers of
 frames become the training inputs.
 """
 
@@ -32,10 +32,10 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.pixels import Sensor
 
 NEAREST, FARTHEST = 0.8, 1.3
-"""Distances of the cameras of a path, relative to the usual distance of their kind."""
+"""Range of the distances of the cameras of a path, relative to the usual distance of the camera."""
 
 IMAGE_STEP = 64
-"""Images grow in steps of so many pixels, so that few compiled programs serve for all."""
+"""Image sizes are multiples of this number of pixels, so that few compiled programs suffice."""
 
 
 class Path(NamedTuple):
@@ -77,7 +77,7 @@ def draw_path(mesh: trimesh.Trimesh, config: DatasetConfig, seed: int) -> Path:
 def draw_poses(
     mesh: trimesh.Trimesh, kind: VirtualCamera, config: DatasetConfig, rng: np.random.Generator
 ) -> jaxlie.SE3:
-    """Poses of a path: an arc about the object, or random views as in the paper."""
+    """Poses of a path: an arc around the object, or random views as in the paper."""
     count, distance = max(config.frames), camera_distance(mesh, kind)
     if rng.random() >= config.arcs:
         key = jax.random.key(int(rng.integers(2**31)))
@@ -92,7 +92,7 @@ def draw_poses(
 def draw_box(
     mesh: trimesh.Trimesh, config: DatasetConfig, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 3"]:
-    """Lower and upper corner of the object's box; in a share of the paths a little too large."""
+    """Lower and upper corner of the object's box; for a share of the paths, slightly too large."""
     bounds = np.array(mesh.bounds)
     if rng.random() < config.faults.loose:
         bounds += np.array([[-1.0], [1.0]]) * rng.uniform(0, 0.06, (2, 3)) * mesh.extents
@@ -100,7 +100,7 @@ def draw_box(
 
 
 def padded(frames: Frames) -> Frames:
-    """Images of a multiple of `IMAGE_STEP` rows and columns; the rays added met nothing."""
+    """Pad images to a multiple of `IMAGE_STEP` rows and columns, with rays that hit nothing."""
     _, h, w = frames.depth.shape
     more = [(0, 0), (0, -h % IMAGE_STEP), (0, -w % IMAGE_STEP)]
     return frames._replace(

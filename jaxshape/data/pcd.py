@@ -16,8 +16,8 @@ class Columns(NamedTuple):
 
     Attributes:
         values: The numbers of each field `[n]`, by its name.
-        viewpoint: Position of the sensor `[3]`; None where the file does not say, as it does not
-            with the default, the origin.
+        viewpoint: Position of the sensor `[3]`; None if the file does not give it, or gives the
+            default, the origin.
     """
 
     values: dict[str, Float[np.ndarray, " n"]]
@@ -61,7 +61,7 @@ def parse_pcd(content: bytes) -> Columns:
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
-    """The entries of the header, and the bytes behind it."""
+    """The entries of the header, and the bytes after it."""
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
@@ -107,7 +107,7 @@ def _ascii(body: bytes, counts: list[int], count: int) -> list[np.ndarray]:
 
 
 def _by_columns(content: bytes, row: np.dtype, count: int) -> list[np.ndarray]:
-    """Fields that lie one behind the other, each of all points."""
+    """Split the content into fields that are stored one after the other, each for all points."""
     columns, start = [], 0
     for i in range(len(row.names or ())):
         field = row[i]
@@ -117,7 +117,7 @@ def _by_columns(content: bytes, row: np.dtype, count: int) -> list[np.ndarray]:
 
 
 def _unpacked(body: bytes, size: int) -> bytes:
-    """The content of a block: its packed and its real size, then LZF's runs and references."""
+    """Decompress a block: its packed and its real size, then runs and references of LZF."""
     packed, real = np.frombuffer(body, "<u4", 2)
     if real != size or size > limits.MESH_BYTES:
         raise ValueError(f"its block holds {real} bytes; expected {size}")
@@ -125,7 +125,7 @@ def _unpacked(body: bytes, size: int) -> bytes:
     while i < len(source) and len(out) <= size:
         control = source[i]
         i += 1
-        if control < 32:  # bytes as they are
+        if control < 32:  # literal bytes
             out += source[i : i + control + 1]
             i += control + 1
             continue

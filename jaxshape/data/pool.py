@@ -1,10 +1,10 @@
-"""Work shared among processes, any of which may die, and all of which die with their parent. [host]
+"""Share work among processes; any of them may die, and all of them end with their parent. [host]
 
     for number, result in in_processes(function, items, workers=8):
         ...                                     # `Died` for an item that kills its process twice
 
-A process works on one item at a time. A process that dies loses its item, which is tried once more
-at the end, alone, since memory may have run out.
+A process works on one item at a time. The item of a process that dies is tried once more at the
+end, alone, since memory may have run out.
 """
 
 import os
@@ -22,7 +22,7 @@ class Died(NamedTuple):
     """The result of an item that killed its process twice.
 
     Attributes:
-        code: Exit status of the process; -9 where signal 9 killed it.
+        code: Exit status of the process; -9 if signal 9 killed it.
     """
 
     code: int
@@ -52,7 +52,7 @@ class _Worker:
             target=_serve, args=(function, inside), daemon=True
         )
         self.process.start()
-        inside.close()  # so that the pipe ends when the process does
+        inside.close()  # so that the pipe closes when the process ends
         self.number: int | None = None
         self.is_ready = False
 
@@ -65,16 +65,16 @@ class _Worker:
 def in_processes(
     function: Callable[[Any], Any], items: Sequence[Any], workers: int
 ) -> Iterator[tuple[int, Any]]:
-    """Results of a function of each item, as they come.
+    """Results of a function for each item, in the order in which they finish.
 
     Args:
-        function: Importable and picklable, as are its argument and result; its errors are raised
-            here.
+        function: An importable and picklable function, with picklable arguments and results; its
+            errors are raised here.
         items: Arguments of the function.
-        workers: Number of processes, 1 or more; 1 works in this process.
+        workers: Number of processes, 1 or more; with 1 this process does the work.
 
     Yields:
-        The number of an item in `items`, and its result; or `Died`.
+        The index of an item in `items`, and its result or `Died`.
 
     Raises:
         WorkersDied: A process ended before it could begin to work.
@@ -96,7 +96,7 @@ def in_processes(
                     answer = Died(_exit_code(worker))
                     crew[crew.index(worker)] = _Worker(function)
                 worker.is_ready = True
-                if number is None:  # it has begun, or died with nothing to do
+                if number is None:  # it has started, or died while idle
                     continue
                 if isinstance(answer, Died) and number not in tried:
                     tried.add(number)
@@ -123,15 +123,15 @@ def _share_out(
             continue
         try:
             worker.pipe.send(items[worker.number])
-        except OSError:  # it died while it had nothing to do; this is noticed next
+        except OSError:  # it died while idle, which the caller notices next
             pass
 
 
 def _exit_code(worker: _Worker) -> int:
-    """The exit status of a process that died at work.
+    """The exit status of a process that died while working.
 
     Raises:
-        WorkersDied: It had no work.
+        WorkersDied: It had not begun to work.
     """
     worker.process.join()
     worker.pipe.close()
@@ -172,8 +172,8 @@ class _Raised(NamedTuple):
 
 
 def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:
-    """The life of a process: an item in, a result out, until the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this process
+    """Main loop of a process: receive an item and send its result, until the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent also gets it, and ends this process
     threading.Thread(target=_die_with_parent, daemon=True).start()
     pipe.send(None)
     while True:

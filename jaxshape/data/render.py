@@ -1,7 +1,7 @@
 """The virtual depth camera of the paper (section 2.3), and the noise of a real one. [host]
 
-Each pixel casts one ray through its centre. The first triangle it meets hides all others; the depth
-is that of the point where the ray intersects the plane of that triangle.
+Each pixel casts one ray through its centre. The first triangle that it hits hides all others; the
+depth is that of the point where the ray intersects the plane of this triangle.
 """
 
 import jax.numpy as jnp
@@ -17,16 +17,16 @@ IMAGE_SIZE = CAMERAS["paper"].width
 """Pixels along each side of the paper's square images."""
 
 TILE = 4
-"""Pixels along each side of the squares in which rays are cast together or not at all."""
+"""Side, in pixels, of the squares in which either all rays are cast or none."""
 
 WINDOW_STEP = 8
-"""Pixels in steps of which a window grows, so that few compiled programs serve for all."""
+"""Window sizes are multiples of this number of pixels, so that few compiled programs suffice."""
 
 
 def fit_intrinsics(
     mesh: trimesh.Trimesh, T_object_camera: jaxlie.SE3, image_size: int = IMAGE_SIZE
 ) -> Intrinsics:
-    """The longest lens with which every view sees the mesh's whole bounding box."""
+    """The largest focal length with which every view shows the mesh's whole bounding box."""
     corners = _corners(mesh, np.asarray(T_object_camera.as_matrix()))
     reach = np.abs(corners[..., :2] / corners[..., 2:]).max()
     focal = (image_size / 2 - 1) / reach
@@ -39,18 +39,18 @@ def window(
 ) -> tuple[Intrinsics, tuple[int, int]]:
     """The part of a camera's images that can show a mesh, the same for all views.
 
-    It holds the sphere around the mesh: rays outside meet nothing, so that they are not cast and
-    their pixels not kept. The window of cameras that look at the centre from the usual distance of
-    their kind is the same for all meshes, so that a compiled program serves all of them.
+    It contains the sphere around the mesh. Rays outside hit nothing, so they are not cast and their
+    pixels are not kept. For a camera that looks at the centre from its usual distance, the window
+    is the same for all meshes, so that one compiled program serves all of them.
 
     Args:
-        camera: The camera. Its whole image is kept where its lens is fitted to the mesh.
+        camera: The camera. Its whole image is kept if its focal length is fitted to the mesh.
         mesh: The mesh in the object frame, in metres.
         T_object_camera: One pose per view.
         margin: Margin of the sphere around the mesh's bounding box, as a share of its radius.
 
     Returns:
-        Intrinsics whose principal point counts from the window's corner, and the window's height
+        Intrinsics with the principal point relative to the window's corner, and the window's height
         and width in pixels.
     """
     if camera.field_of_view is None:
@@ -78,11 +78,11 @@ def render_depth(
     intrinsics: Intrinsics,
     image_size: int | tuple[int, int] = IMAGE_SIZE,
 ) -> tuple[Float[np.ndarray, "views h w"], Float[np.ndarray, "views h w"]]:
-    """Depth images of a mesh, in metres, and the cosine at which each pixel meets its surface.
+    """Depth images of a mesh, in metres, and each pixel's cosine between ray and surface normal.
 
-    Depth is infinite where the ray meets nothing; the cosine is 1 there. `T_object_camera` holds
-    one pose per view; `image_size` is the side of square images, or height and width. True
-    visibility: among all triangles on a ray the nearest counts.
+    Depth is infinite where the ray hits nothing; the cosine is 1 there. `T_object_camera` holds one
+    pose per view; `image_size` is the side of square images, or height and width. Visibility is
+    exact: the nearest of all triangles on a ray counts.
     """
     size = (image_size, image_size) if isinstance(image_size, int) else image_size
     rays = _rays(intrinsics, size)
@@ -91,7 +91,7 @@ def render_depth(
     corners, normals = mesh.triangles[:, 0], mesh.face_normals
     depth = np.full(may_hit.shape, np.inf, np.float32)
     cosine = np.ones_like(depth)
-    for i, pose in enumerate(poses):  # one by one, views stay in the processor's cache
+    for i, pose in enumerate(poses):  # one view at a time stays in the processor's cache
         pixel, origin = np.flatnonzero(may_hit[i]), pose[:3, 3]
         directions = rays[pixel] @ pose[:3, :3].T
         triangle = mesh.ray.intersects_first(np.broadcast_to(origin, directions.shape), directions)
@@ -133,8 +133,7 @@ def _may_hit(
     intrinsics: Intrinsics,
     size: tuple[int, int],
 ) -> Bool[np.ndarray, "views h w"]:
-    """Pixels in tiles that a triangle may touch: all pixels that can hit the mesh, and few
-    others."""
+    """Pixels in tiles that a triangle may touch: all that can hit the mesh, and few others."""
     rows, columns = -(-size[0] // TILE), -(-size[1] // TILE)
     points = (mesh.vertices - poses[:, None, :3, 3]) @ poses[:, :3, :3]
     depth = points[..., 2]
@@ -151,7 +150,7 @@ def _ends(
     pixels: Float[np.ndarray, "views vertices"], faces: Int[np.ndarray, "faces 3"], count: int
 ) -> tuple[Int[np.ndarray, "views faces"], Int[np.ndarray, "views faces"]]:
     """First tile that each triangle may touch along one axis, and the one after its last."""
-    # A hundredth of a pixel makes up for rounding.
+    # The hundredth of a pixel allows for rounding.
     low = np.floor((pixels - 0.01) / TILE).astype(np.int32)
     high = np.floor((pixels + 0.01) / TILE).astype(np.int32) + 1
     a, b, c = (low[:, faces[:, i]] for i in range(3))
@@ -193,10 +192,10 @@ def add_sensor_noise(
     rng: np.random.Generator,
     noise: SensorNoise = SensorNoise(),
 ) -> Float[np.ndarray, "views h w"]:
-    """The depths that a real sensor would have reported; lost pixels become 0, nothing known."""
+    """The depths that a real sensor would have reported; lost pixels become 0."""
     noisy, (h, w) = depth.copy(), depth.shape[1:]
     flat, rows = noisy.reshape(-1), np.arange(len(depth)) * h
-    # Only edges show jitter across the image; elsewhere it would act as axial noise.
+    # Lateral jitter is applied only at edges; elsewhere it would act as axial noise.
     edges = np.flatnonzero(np.stack([_is_edge(image) for image in depth]))
     jitter = np.rint(rng.normal(0, noise.lateral, (2, len(edges)))).astype(int)
     (view, row), column = divmod(edges // w, h), edges % w
@@ -214,7 +213,7 @@ def add_sensor_noise(
 
 
 def _is_edge(depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """True where a neighbour's depth differs by more than 5 %, or is of the background."""
+    """True where a neighbour's depth differs by more than 5 %, or belongs to the background."""
     inverse = 1 / depth
     tolerance = 0.05 * inverse.max()
     down = np.abs(inverse[1:] - inverse[:-1]) > tolerance

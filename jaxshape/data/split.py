@@ -1,4 +1,4 @@
-"""The meshes of a collection that are kept out of training, chosen by their shapes. [host]"""
+"""Choose the meshes of a collection that are kept out of training, by their shapes. [host]"""
 
 import hashlib
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ SHARE = 0.1
 """Share of the meshes that are held out."""
 
 SAME = 1e-3
-"""Signatures that differ less, in all numbers, are of the same shape."""
+"""Signatures whose numbers all differ by less than this belong to the same shape."""
 
 COARSE = 2
-"""Decimals of a signature that decide the side of a mesh."""
+"""Number of decimals of a signature that decide the side of a mesh."""
 
 
 def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[MeshSource]]:
-    """Divide meshes into those to train on, and about every tenth, but at least one, held out.
+    """Split meshes into training meshes and held-out ones: about every tenth, at least one.
 
-    The side depends on the shape alone, not on the name, the folder or the format: a mesh stays on
-    its side when others join the collection, so that training can go on from earlier weights and
-    never meets a mesh it is scored on; and copies are on one side.
+    The side depends only on the shape, not on the name, the folder or the format. A mesh therefore
+    stays on its side when others join the collection: training can continue from earlier weights
+    and never uses a mesh that it is scored on. Copies of a mesh are on the same side.
 
     Args:
         meshes: Meshes of the collection, of which two or more are usable and differ.
@@ -74,6 +74,6 @@ def same_shapes(meshes: Sequence[Surveyed]) -> list[int]:
 
 
 def _mark(mesh: Surveyed) -> float:
-    """A number from 0 to 1 that is spread evenly over shapes."""
+    """A pseudo-random number from 0 to 1, uniformly distributed over shapes."""
     rounded = " ".join(f"{value:.{COARSE}f}" for value in mesh.signature)
     return int.from_bytes(hashlib.sha256(rounded.encode()).digest()[:8]) / 2**64

@@ -1,6 +1,6 @@
 """A survey of many meshes before any of them is used, in parallel. [host]
 
-Sizes tell the unit, shapes tell duplicates in any format, and seats tell the axis that points up.
+Sizes show the unit, shapes show duplicates in any format, and seats show the axis that points up.
 No geometry is kept.
 """
 
@@ -18,10 +18,10 @@ from jaxshape.data.meshes import Skipped, load, lying_on_its_side
 from jaxshape.data.pool import Died, in_processes
 
 PLAUSIBLE = 0.05, 5.0
-"""Median diagonals, in metres, between which a collection is taken for things in a room."""
+"""Range of median diagonals, in metres, of a plausible collection of objects in a room."""
 
 IN_A_PROCESS = 8
-"""Meshes from which on it pays to start processes."""
+"""Number of meshes from which starting processes pays off."""
 
 
 class Surveyed(NamedTuple):
@@ -29,10 +29,10 @@ class Surveyed(NamedTuple):
 
     Attributes:
         source: The mesh file.
-        size: Diagonal of its box, in metres if the unit is right; 0 where it cannot be used.
-        signature: Numbers that tell its shape, see `signature_of`; empty where it cannot be used.
+        size: Diagonal of its box, in metres if the unit is right; 0 if the mesh cannot be used.
+        signature: Numbers that identify its shape, see `signature_of`; empty if it cannot be used.
         lies: Whether it is a seat that seems to lie on its side.
-        skipped: Why it cannot be used; None where it can.
+        skipped: Why the mesh cannot be used; None if it can.
     """
 
     source: MeshSource
@@ -50,17 +50,17 @@ def survey(
     unit: UnitName = "m",
     workers: int | None = None,
 ) -> Iterator[tuple[int, Surveyed]]:
-    """Look at each mesh once.
+    """Examine each mesh once.
 
     Args:
         sources: The meshes.
         up: Axis of the files that points up.
-        front: Axis of the files along which the object's front looks.
+        front: Axis of the files towards which the object faces.
         unit: Unit of the files.
         workers: Processes, 1 or more; None for one for each CPU core.
 
     Yields:
-        The number of a mesh in `sources`, and its survey, in the order in which they finish.
+        The index of a mesh in `sources`, and its survey, in the order in which they finish.
     """
     workers = workers or os.cpu_count() or 1
     if len(sources) < IN_A_PROCESS:
@@ -74,12 +74,12 @@ def survey(
 
 
 def look(source: MeshSource, *, up: str, front: str, unit: UnitName) -> Surveyed:
-    """Look at one mesh.
+    """Examine one mesh.
 
     Args:
         source: The mesh.
         up: Axis of the file that points up.
-        front: Axis of the file along which the object's front looks.
+        front: Axis of the file towards which the object faces.
         unit: Unit of the file.
     """
     model = load(source, up=up, front=front, unit=unit)
@@ -91,8 +91,8 @@ def look(source: MeshSource, *, up: str, front: str, unit: UnitName) -> Surveyed
 
 
 def signature_of(mesh: trimesh.Trimesh) -> tuple[float, ...]:
-    """Thirteen numbers of a shape that stay when it is scaled, moved, turned to other axes, cut
-    into other triangles, or written in another format.
+    """Thirteen numbers of a shape that do not change when it is scaled, moved, turned to other
+    axes, divided into other triangles, or written in another format.
 
     They are integrals over the surface, as shares of the diagonal: area, extents, centre and second
     moments, in an order that does not depend on the axes.
@@ -118,11 +118,11 @@ def signature_of(mesh: trimesh.Trimesh) -> tuple[float, ...]:
 
 
 def doubted_size(sizes: Sequence[float], unit: UnitName) -> str | None:
-    """A sentence on the unit of a collection, if its sizes fit nothing in a room.
+    """A sentence on the unit of a collection, if its sizes are implausible for objects in a room.
 
     Args:
         sizes: Diagonals of its meshes, in metres if the unit is right.
-        unit: The unit that they were read with.
+        unit: The unit in which they were read.
 
     Returns:
         A sentence with the problem and a remedy; None without a problem.

@@ -1,4 +1,4 @@
-"""Depth cameras that a virtual one can stand for."""
+"""Depth cameras that can be simulated."""
 
 from dataclasses import dataclass, field
 
@@ -41,15 +41,15 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class VirtualCamera:
-    """A depth camera, and where it usually stands.
+    """A depth camera, and its usual distance.
 
     Attributes:
         width: Pixels along each row.
         height: Pixels along each column.
-        field_of_view: Across the width, in degrees; None for the longest lens with which every
-            view sees the whole object, as in the paper.
+        field_of_view: Horizontal field of view, in degrees; None for the largest focal length with
+            which every view shows the whole object, as in the paper.
         distance: Distance of the camera from the object's centre, in diagonals of its bounding box.
-        noise: The faults of its sensor, where noise is asked for.
+        noise: The faults of its sensor, if noise is requested.
 
     Raises:
         ValueError: The image is empty, the camera stands inside the object, or the field of view
@@ -78,23 +78,24 @@ CAMERAS: dict[CameraName, VirtualCamera] = {
     "paper": VirtualCamera(96, 96, None),
     # The first Kinect, of a focal length of 525 pixels; a chair of 0.85 m then stands 2 m away.
     "kinect": VirtualCamera(640, 480, 62.7, 1.8),
-    # D435: 87 degrees over 848 pixels of which 640 are kept; an error of 0.08 pixels of disparity
+    # D435: 87 degrees over 848 pixels, of which 640 are kept; an error of 0.08 pixels of disparity
     # between sensors that are 50 mm apart.
     "realsense": VirtualCamera(
         640, 480, 71.2, 1.3, SensorNoise(4e-3, 0.5, 1e-4, dropout=0.5, grazing=85.0)
     ),
-    # A grid of points through which a network draws surfaces, so that edges are soft, nothing is
-    # lost, and the error is about 1 cm in a room (Luetzenburg et al., Scientific Reports, 2021).
+    # A network interpolates surfaces through a grid of points, so that edges are soft, no pixels
+    # are lost, and the error is about 1 cm in a room (Luetzenburg et al., Scientific Reports,
+    # 2021).
     "iphone-lidar": VirtualCamera(
         256, 192, 62.0, 1.2, SensorNoise(3e-3, 0.6, 1e-3, dropout=0.0, grazing=88.0)
     ),
 }
-"""Cameras by name. Distances put some 240 pixels of a Kinect on a chair; people stand nearer with
-a wider lens or fewer pixels."""
+"""Cameras by name. At these distances a chair covers about 240 pixels of a Kinect; people stand
+nearer with a wider lens or fewer pixels."""
 
 
 def virtual_camera(name: CameraName) -> VirtualCamera:
-    """A depth camera by name, at the distance at which people hold it.
+    """A depth camera by name, at the distance from which people use it.
 
     Args:
         name: "kinect", "realsense", "iphone-lidar", or "paper" for the paper's square images.

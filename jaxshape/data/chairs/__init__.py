@@ -1,4 +1,4 @@
-"""Procedural chairs: endless, deterministic training shapes that ship with the library.
+"""Procedural chairs: unlimited, deterministic training shapes that come with the library.
 
 A chair is drawn in the order of its modules: `primitives` (closed surfaces), `seats`, `bases`,
 `backs`, `arms`, `shells` and `upholstery` (the parts), `family` (styles, frequencies, sizes).

@@ -1,4 +1,4 @@
-"""The styles of the family: which seats, bases, backs and arms meet, how often, how big."""
+"""The styles of the family: combinations of seats, bases, backs and arms, frequencies, sizes."""
 
 import numpy as np
 import trimesh

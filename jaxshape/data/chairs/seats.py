@@ -22,7 +22,7 @@ def draw_seat(
     height: Range = (0.42, 0.48),
     round_chance: Number = 0.12,
 ) -> Board:
-    """A seat within the given ranges; the taper and the outline follow."""
+    """Draw a seat within the given ranges, with its taper and outline."""
     seat_width, seat_depth = draw.between(*width), draw.between(*depth)
     is_round = draw.chance(round_chance)
     if is_round:
@@ -43,8 +43,7 @@ def draw_seat(
 def seat_parts(
     draw: Draw, seat: Board, options: Weights, *, aprons: bool
 ) -> tuple[list[Part], Board]:
-    """The parts of a seat, and the seat to which legs attach (without parts that lie on the
-    frame)."""
+    """The parts of a seat, and the board to which legs attach (without parts on the frame)."""
     kind = draw.named("seat", options)
     if kind == "block":
         seat = seat._replace(thickness=draw.between(0.06, 0.14))

@@ -18,7 +18,7 @@ from jaxshape.data.procedural.primitives import (
     unit,
 )
 
-# Closer together at both ends, where the outline turns its corners.
+# Denser at both ends, where the outline has its corners.
 _STATIONS = 0.5 * np.linspace(0, 1, 20) + 0.25 * (1 - np.cos(np.pi * np.linspace(0, 1, 20)))
 
 
@@ -72,7 +72,7 @@ def shell_parts(draw: Draw, seat: Board, height: Range = (0.3, 0.5)) -> list[Par
     corners = [(depth / 2, seat.height - lip), (depth * 0.3, seat.height),
                (-depth / 2 + 0.04, seat.height - rear), (-depth / 2 - lean * 0.5,
                seat.height + tall * 0.5), (-depth / 2 - lean, seat.height + tall)]  # fmt: skip
-    # A side that rises more than the bend's radius would fold into itself.
+    # A side that rises by more than the radius of the bend would intersect itself.
     radius = draw.between(0.12, 0.22) if kind == "bucket" else draw.between(0.05, 0.16)
     profile = bent_profile(corners, radius)
     share = profile.share

@@ -18,7 +18,7 @@ def read_parts(suffix: str, content: bytes, read_relative: Callable[[str], bytes
 
     Args:
         suffix: Suffix of its name, with the dot, in lower case.
-        content: All of the file.
+        content: Content of the file.
         read_relative: Reads a file by its path relative to this one.
 
     Raises:

@@ -14,7 +14,7 @@ UNDERSTOOD = {
     "KHR_draco_mesh_compression", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
     "KHR_node_visibility",
 }  # fmt: skip
-"""Extensions that change shapes, and are read."""
+"""Extensions that change shapes and are supported."""
 
 HARMLESS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "MSFT_packing_",
@@ -22,7 +22,7 @@ HARMLESS = (
     "ADOBE_materials_", "KHR_audio", "KHR_node_hoverability", "KHR_node_selectability",
     "KHR_interactivity", "CESIUM_primitive_outline", "EXT_structural_metadata",
 )  # fmt: skip
-"""Beginnings of the names of extensions that leave shapes as they are."""
+"""Prefixes of the names of extensions that do not change shapes."""
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _NO_SURFACE = (0, 1, 2, 3)
@@ -35,7 +35,7 @@ def read_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> list[Par
     """The triangles of a `.gltf` or `.glb` file, one part for each primitive of each node.
 
     Args:
-        content: All of the file.
+        content: Content of the file.
         read_relative: Reads a file by its path relative to this one.
 
     Raises:
@@ -106,7 +106,7 @@ def _matrix(node: dict[str, Any]) -> Matrix:
 
 
 def _transform(translation: Any, xyzw: Any, scale: Any) -> Matrix:
-    """Scale, then turn, then move."""
+    """Matrix that scales, then rotates, then translates."""
     x, y, z, w = np.asarray(xyzw, np.float64) / (np.linalg.norm(xyzw) or 1.0)
     rotation = np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -120,7 +120,7 @@ def _transform(translation: Any, xyzw: Any, scale: Any) -> Matrix:
 
 
 def _shown(file: GltfFile) -> Iterator[tuple[int, list[str]]]:
-    """Nodes of the scene that are visible, with the names on the way to them."""
+    """Visible nodes of the scene, with the names of their ancestors."""
     nodes = file.list("nodes")
     if scenes := file.list("scenes"):
         roots = scenes[file.header.get("scene", 0)].get("nodes", [])
@@ -139,7 +139,7 @@ def _shown(file: GltfFile) -> Iterator[tuple[int, list[str]]]:
 
 
 def _instances(file: GltfFile, node: dict[str, Any]) -> Iterator[Matrix]:
-    """Where the copies of a node's mesh stand in its frame."""
+    """Transforms of the copies of a node's mesh in the frame of the node."""
     about = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
     if about is None:
         yield np.eye(4)
@@ -156,7 +156,7 @@ def _instances(file: GltfFile, node: dict[str, Any]) -> Iterator[Matrix]:
 
 
 def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> Iterator[Part]:
-    """The parts of a node's mesh, in the frame of the node, or of the scene where it has a skin."""
+    """The parts of a node's mesh, in the frame of the node or, if it has a skin, of the scene."""
     mesh = file.list("meshes")[node["mesh"]]
     weights = node.get("weights", mesh.get("weights", []))
     for primitive in mesh["primitives"]:
@@ -211,7 +211,7 @@ def _bent(
     attributes: dict[str, np.ndarray],
     vertices: Float[np.ndarray, "v 3"],
 ) -> Float[np.ndarray, "v 3"]:
-    """Vertices moved with the joints that they hang on, in the frame of the scene."""
+    """Vertices moved by their joints, in the frame of the scene."""
     about = file.list("skins")[skin]
     joints = np.stack([placed[i] for i in about["joints"]])
     if "inverseBindMatrices" in about:
@@ -234,7 +234,7 @@ def _bent(
 
 
 def _moved(part: Part, names: list[str], matrix: Matrix) -> Part:
-    """The part in the frame of the scene, its triangles showing the same side."""
+    """The part in the frame of the scene; its triangles keep the side that they face."""
     vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
     faces = part.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else part.faces
     return Part("/".join(filter(None, [*names, part.name])), vertices, faces)

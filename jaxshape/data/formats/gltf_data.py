@@ -22,7 +22,7 @@ class GltfFile(NamedTuple):
 
     Attributes:
         header: The JSON header.
-        buffers: Content of each of its buffers; None where only an extension could fill it.
+        buffers: Content of each of its buffers; None if only an extension can fill it.
     """
 
     header: dict[str, Any]
@@ -33,7 +33,7 @@ class GltfFile(NamedTuple):
         return self.header.get(name, [])
 
     def accessor(self, index: int) -> np.ndarray:
-        """Numbers `[count width]` of an accessor, as floats where they are normalized integers."""
+        """Numbers `[count width]` of an accessor; normalized integers are converted to floats."""
         about = self.list("accessors")[index]
         kind, width, count = _TYPES[about["componentType"]], _WIDTHS[about["type"]], about["count"]
         if not 0 <= count * width * np.dtype(kind).itemsize <= MESH_BYTES:
@@ -66,7 +66,7 @@ class GltfFile(NamedTuple):
         return values
 
     def view(self, index: int, kind: str, width: int, count: int, start: int) -> np.ndarray:
-        """Numbers `[count width]` of a buffer view, from some byte on."""
+        """Numbers `[count width]` of a buffer view, from the byte `start` on."""
         about, size = self.list("bufferViews")[index], np.dtype(kind).itemsize
         content, row = self.view_bytes(index), about.get("byteStride", width * size)
         if start < 0 or row < 1 or start + (count - 1) * row + width * size > len(content):
@@ -169,7 +169,7 @@ def referred(content: bytes) -> list[str]:
         return []
     try:
         uris = [about.get("uri", "data:") for about in json.loads(content).get("buffers", [])]
-    except (ValueError, RecursionError, AttributeError):  # reported by whoever loads it
+    except (ValueError, RecursionError, AttributeError):  # the reader of the file reports this
         return []
     return [urllib.parse.unquote(uri) for uri in uris if not uri.startswith("data:")]
 
@@ -188,11 +188,11 @@ def _file(uri: str, read_relative: Callable[[str], bytes]) -> bytes:
 def draco_mesh(
     file: GltfFile, primitive: dict[str, Any]
 ) -> tuple[dict[str, np.ndarray], np.ndarray] | None:
-    """Attributes and corners of a primitive that Draco compressed; None where it is not.
+    """Attributes and corners of a primitive that is compressed by Draco; None if it is not.
 
     Args:
         file: The file.
-        primitive: The primitive, as its JSON says.
+        primitive: The JSON description of the primitive.
 
     Raises:
         NotSupported: The library that decodes it is missing.

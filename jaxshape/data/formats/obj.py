@@ -12,11 +12,11 @@ NOT_POLYGONS = {
     "curv": "curves", "curv2": "curves", "surf": "free-form surfaces", "call": "other files",
     "bzp": "Bezier patches", "bsp": "B-spline patches", "cdp": "Cardinal patches", "res": "patches",
 }  # fmt: skip
-"""Statements that stand for surfaces which are not read."""
+"""Statements of surfaces that are not supported."""
 
 
 class _Face(NamedTuple):
-    """A face as it stands in the file.
+    """A face as written in the file.
 
     Attributes:
         corners: Words of its corners, such as `3/1/2`.
@@ -31,7 +31,7 @@ def read_obj(content: bytes) -> list[Part]:
     """The polygons of an OBJ file as triangles, one part for each object and group.
 
     Args:
-        content: All of the file.
+        content: Content of the file.
 
     Raises:
         Unreadable: The file is damaged.
@@ -73,6 +73,6 @@ def _part(name: str, points: np.ndarray, faces: list[_Face]) -> Part:
     if (indices == 0).any():
         raise Unreadable("A face refers to vertex 0, but an OBJ file counts from 1.")
     before = np.repeat([face.before for face in faces], counts)
-    # Numbers below 0 count back from the vertices that stand before the face.
+    # Numbers below 0 count backwards from the last vertex before the face.
     indices = np.where(indices < 0, indices + before, indices - 1)
     return Part(name, points, triangulate(points, indices, counts))

@@ -12,7 +12,7 @@ def read_off(content: bytes) -> list[Part]:
     """The polygons of an OFF file as triangles.
 
     Args:
-        content: All of the file.
+        content: Content of the file.
 
     Raises:
         Unreadable: The file is damaged, or does not hold as much as its header says.
@@ -25,7 +25,7 @@ def read_off(content: bytes) -> list[Part]:
         raise Unreadable("The file does not begin with OFF.")
     if kind[2] or kind[3] or re.match(r"\s*BINARY", text[kind.end() :]):
         raise NotSupported(f"The file is of the kind {text.split(chr(10))[0][:20]!r}; export OFF.")
-    # Many ModelNet files run the counts into the header: "OFF490926 518 0".
+    # Many ModelNet files have no space between header and counts: "OFF490926 518 0".
     counts, *rows = [line.split() for line in text[kind.end() :].split("\n") if line.strip()] or [
         []
     ]
@@ -44,7 +44,7 @@ def read_off(content: bytes) -> list[Part]:
 
 
 def _faces(rows: list[list[str]]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of all faces, and how many each has; colours behind them are left out."""
+    """Indices of all faces, and their number in each; colours after them are left out."""
     try:
         counts = [int(row[0]) for row in rows]
         indices = [

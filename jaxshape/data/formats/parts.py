@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from jaxshape.limits import MESH_FACES
 
 MAX_FACES = MESH_FACES
-"""Most triangles of one mesh, counted over all its instances in a scene."""
+"""Largest number of triangles of one mesh, counted over all its instances in a scene."""
 
 
 class Part(NamedTuple):
@@ -17,7 +17,7 @@ class Part(NamedTuple):
     Attributes:
         name: Names of the nodes, the object or the group, joined by `/`; empty where there is none.
         vertices: Corners, in the frame and the unit of the file.
-        faces: Rows of `vertices`, three for each triangle.
+        faces: Indices into `vertices`, three for each triangle.
     """
 
     name: str
@@ -62,7 +62,7 @@ def text_of(content: bytes) -> str:
 
 
 def positions(rows: list[list[str]]) -> Float[np.ndarray, "v 3"]:
-    """Numbers of vertices, of which all words behind the third are left out.
+    """Coordinates of vertices; all words after the third are ignored.
 
     Args:
         rows: Words of each vertex.

@@ -48,7 +48,7 @@ def read_ply(content: bytes) -> list[Part]:
     """The polygons of a PLY file as triangles.
 
     Args:
-        content: All of the file.
+        content: Content of the file.
 
     Raises:
         Unreadable: The file is damaged, or does not hold as much as its header says.
@@ -57,7 +57,7 @@ def read_ply(content: bytes) -> list[Part]:
     """
     encoding, elements, data = _header(content)
     order = {"binary_big_endian": ">", "binary_little_endian": "<"}.get(encoding)
-    if order is None:  # numbers as text are read as binary ones of eight bytes
+    if order is None:  # numbers in text are converted to binary ones of eight bytes
         elements, data, order = _from_text(elements, data)
     columns, offset = {}, 0
     for element in elements:
@@ -73,7 +73,7 @@ def read_ply(content: bytes) -> list[Part]:
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
-    """Encoding and elements of the file, and the bytes behind its header."""
+    """Encoding and elements of the file, and the bytes after its header."""
     head, end, data = content.partition(b"end_header")
     lines = [line.split() for line in head.decode("latin-1").splitlines()]
     if not end or not lines or lines[0] != ["ply"]:
@@ -112,7 +112,7 @@ def _from_text(elements: list[_Element], data: bytes) -> tuple[list[_Element], b
 
 
 def _read(element: _Element, data: bytes, offset: int, order: str) -> tuple[dict[str, Any], int]:
-    """Columns of an element, lists as their numbers and their lengths; and where it ends."""
+    """Columns of an element (for lists: numbers and lengths), and the offset of its end."""
     if element.length == 0:
         return {}, offset
     if not element.properties:
@@ -134,7 +134,7 @@ def _column(rows: np.ndarray, one: _Property) -> Any:
 
 
 def _row_type(element: _Element, data: bytes, offset: int, order: str) -> np.dtype:
-    """A row of an element, if all rows had lists as long as the first one has."""
+    """Type of a row of an element, if all rows have lists as long as the first row."""
     fields: list[Any] = []
     for one in element.properties:
         if one.count:
@@ -187,7 +187,7 @@ def _read_rows(
 def _polygons(
     elements: list[_Element], columns: dict[str, dict[str, Any]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of all polygons of the file, and how many each has."""
+    """Corners of all polygons of the file, and their number in each."""
     indices, counts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for element in elements:
         corners = [one for one in element.properties if one.count and one.name in _CORNERS]
@@ -215,10 +215,10 @@ def _strips(flat: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 
 def strip_triangles(strip: np.ndarray) -> np.ndarray:
-    """Triangles `[f 3]` of a strip, each turned so that it shows the side of the first.
+    """Triangles `[f 3]` of a strip, all oriented like the first.
 
     Args:
-        strip: Corners `[n]`, of which each three neighbours are a triangle.
+        strip: Corners `[n]`; every three neighbours form a triangle.
     """
     i = np.arange(max(len(strip) - 2, 0))
     return strip[np.stack([i, i + 1 + i % 2, i + 2 - i % 2], axis=1)]

@@ -1,4 +1,4 @@
-"""Polygons into triangles: fans where they are convex, ears cut off where they are not."""
+"""Triangulation of polygons: fans if they are convex, ear clipping if they are not."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from jaxshape.data.formats.parts import NotSupported, Unreadable, check_faces
 
 MAX_CORNERS = 10_000
-"""Most corners of a polygon that is not convex: the time for its ears may grow with the square."""
+"""Largest number of corners of a non-convex polygon: ear clipping may take quadratic time."""
 
 
 def triangulate(
@@ -18,15 +18,15 @@ def triangulate(
 
     Args:
         vertices: Corners of all polygons.
-        indices: Rows of `vertices`, polygon after polygon.
+        indices: Indices into `vertices`, polygon after polygon.
         counts: Number of corners of each polygon; polygons with fewer than three have no area.
 
     Returns:
-        Rows of `vertices`, `count - 2` triangles for each polygon; fewer where corners repeat.
+        Indices into `vertices`, `count - 2` triangles for each polygon; fewer if corners repeat.
 
     Raises:
         NotSupported: A polygon that is not convex has more than `MAX_CORNERS` corners.
-        Unreadable: A polygon refers to a vertex that is not there.
+        Unreadable: A polygon refers to a vertex that does not exist.
         TooManyFaces: There are too many triangles.
     """
     if len(indices) and not 0 <= indices.min() <= indices.max() < len(vertices):
@@ -56,8 +56,8 @@ def _fan(count: int) -> Int[np.ndarray, "f 3"]:
 
 
 def _convex(vertices: Float[np.ndarray, "v 3"], polygons: Int[np.ndarray, "p n"]) -> np.ndarray:
-    """True where a polygon turns one way at all corners; also where it is a triangle or no polygon,
-    with corners that are not finite."""
+    """True for polygons that turn in the same direction at all corners; also for triangles, and for
+    polygons with corners that are not finite."""
     if polygons.shape[1] == 3:
         return np.ones(len(polygons), bool)
     corners = vertices[polygons]
@@ -76,7 +76,7 @@ def _normals(corners: Float[np.ndarray, "p n 3"]) -> Float[np.ndarray, "p 3"]:
 
 
 def _ears(corners: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "f 3"]:
-    """Triangles of one polygon, cut in the plane of two axes that shows most of it."""
+    """Triangles of one polygon, by ear clipping in the axis plane with its largest projection."""
     import mapbox_earcut
 
     normal = _normals(corners[None])[0]
@@ -87,6 +87,6 @@ def _ears(corners: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "f 3"]:
     cut = np.asarray(cut, np.int64).reshape(-1, 3)
     a, b, c = flat[cut].transpose(1, 0, 2)
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    backwards = area * normal[axis] < 0  # keep the side that the polygon shows
+    backwards = area * normal[axis] < 0  # keep the orientation of the polygon
     cut[backwards] = cut[backwards][:, ::-1]
     return cut

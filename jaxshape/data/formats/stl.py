@@ -14,7 +14,7 @@ def read_stl(content: bytes) -> list[Part]:
     """The triangles of an STL file.
 
     Args:
-        content: All of the file.
+        content: Content of the file.
 
     Raises:
         Unreadable: The file is damaged, or does not hold as many triangles as it says.
@@ -23,7 +23,7 @@ def read_stl(content: bytes) -> list[Part]:
     count = int.from_bytes(content[80:_HEADER], "little")
     if len(content) == _HEADER + count * _FACE:
         return [_binary(content, count)]
-    if re.match(rb"\s*solid\b", content) and b"facet" in content:  # binary ones may begin so, too
+    if re.match(rb"\s*solid\b", content) and b"facet" in content:  # binary files may begin so, too
         return [_text(text_of(content))]
     size = len(content)
     raise Unreadable(f"The header says {count} triangles, which does not fit {size} bytes.")

@@ -1,4 +1,4 @@
-"""Level boards, and the rails under them."""
+"""Horizontal boards, and the rails under them."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from jaxshape.data.procedural.primitives import Part, bars, box, shift, superell
 
 
 class Board(NamedTuple):
-    """A level board about x = z = 0: a seat, a table top. In metres.
+    """A horizontal board centred at x = z = 0, such as a seat or a table top, in metres.
 
     Attributes:
         width: Extent along x.

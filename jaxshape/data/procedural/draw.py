@@ -1,4 +1,4 @@
-"""Readable draws from a random generator, remembered by name."""
+"""Readable draws from a random generator, recorded by name."""
 
 import numpy as np
 
@@ -10,8 +10,8 @@ Weights = dict[str, float]
 class Draw:
     """The random choices of one object.
 
-    `record` keeps the named ones for the mesh's metadata; `stoutness` makes all the frame's
-    members thicker than usual, or thinner.
+    `record` keeps the named choices for the mesh's metadata; `stoutness` makes all bars of the
+    frame thicker or thinner than usual.
     """
 
     def __init__(self, rng: np.random.Generator):
@@ -44,7 +44,7 @@ class Draw:
         return last
 
     def named(self, trait: str, options: Weights) -> str:
-        """`pick`, remembered under the name of the trait."""
+        """`pick`, recorded under the name of the trait."""
         name = self.pick(options)
         self.record[trait] = name
         return name

@@ -27,7 +27,7 @@ def place_legs(
 ) -> Legs:
     """Legs under the corners of the board, spread outward by `splay` metres at the floor.
 
-    `raked` is the chance that the back legs lean backward.
+    `raked` is the probability that the back legs lean backward.
     """
     y, front = board.height - board.thickness, board.depth / 2 - inset
     reach = 1.0 if board.exponent > 2.5 else 0.75
@@ -52,8 +52,8 @@ def four_legs(
 ) -> list[Part]:
     """Legs of one of seven kinds, and maybe stretchers.
 
-    `scale` multiplies the thickness of a chair's legs and their distance from the edge, `tied` is
-    the chance of stretchers, which follows from the height where it is not given.
+    `scale` multiplies the thickness of a chair's legs and their distance from the edge. `tied` is
+    the probability of stretchers; None derives it from the height.
     """
     splay = draw.between(0.0, 0.02) if draw.chance(0.6) else draw.between(0.02, 0.12)
     flush = draw.chance(0.5)

@@ -17,8 +17,7 @@ from jaxshape.data.procedural.primitives import (
 
 
 def column(draw: Draw, foot: Number, top: float, scale: Number = 1.0) -> list[Part]:
-    """The upright of a pedestal, straight, telescopic or waisted: `scale` times as thick as a
-    chair's."""
+    """A pedestal's upright, straight, telescopic or waisted: `scale` times a chair's thickness."""
     radius = scale * draw.between(0.015, 0.045)
     kind = draw.pick({"straight": 0.4, "telescopic": 0.4, "trumpet": 0.2})
     middle = foot + (top - foot) * draw.between(0.35, 0.65)
@@ -56,9 +55,10 @@ def star(
     reach: Range = (0.5, 0.72),
     scale: Number = 1.0,
 ) -> list[Part]:
-    """Three to five arms about a column, on castors or glides.
+    """Three to five arms around a column, on castors or glides.
 
-    `reach` is the arms' length over the board's width, `scale` times a chair's are they thick.
+    `reach` is the length of the arms over the board's width; they are `scale` times as thick as a
+    chair's.
     """
     castors = draw.chance(0.3) if castors is None else castors
     count = 5 if castors else draw.count(3, 5)

@@ -1,7 +1,7 @@
 """Closed surfaces from plain arrays: all procedural objects are made of lofts, tubes and slabs.
 
-Construction frame: metres, +y up, +z front, the floor at y = 0. A `Part` may be inside out;
-`assemble` turns every piece outward once, so the primitives need no rule about winding.
+Construction frame: metres, +y up, +z front, the floor at y = 0. A `Part` may be inside out:
+`assemble` turns every piece outward, so the primitives need no winding order.
 """
 
 from collections.abc import Sequence
@@ -51,8 +51,8 @@ def _loft_faces(rings: int, sides: int, loop: bool) -> np.ndarray:
 def loft(rings: np.ndarray, *, loop: bool = False) -> Part:
     """Skin rings of shape [..., rings, sides, 3]; the ends are capped, or joined by `loop`.
 
-    A cap pairs vertex j with vertex sides-1-j: `sides` must be even, and an end ring must be convex
-    or a strip that runs forth and back.
+    A cap connects vertex j with vertex sides-1-j: `sides` must be even, and an end ring must be
+    convex, or a strip that runs back and forth.
     """
     rings = rings.reshape(-1, *rings.shape[-3:])
     pieces, count, sides, _ = rings.shape
@@ -103,7 +103,7 @@ def bars(
     sides: int = 4,
     profile: Numbers = (1.0, 1.0),
 ) -> Part:
-    """Straight bars; `profile` scales the section at even stations from start to end.
+    """Straight bars; `profile` scales the cross-section at equal intervals from start to end.
 
     `width` is measured along x on upright bars and horizontally on lying ones.
     """
@@ -247,7 +247,7 @@ def both_sides(part: Part) -> Part:
 
 
 def assemble(parts: Sequence[Part]) -> trimesh.Trimesh:
-    """Join the parts into one mesh, each piece turned outward, its bounding box at the origin."""
+    """Join the parts into one mesh, each piece facing outward, its box centred at the origin."""
     vertices = np.concatenate([part.vertices.reshape(-1, 3) for part in parts])
     faces, sizes, offset = [], [], 0
     for part in parts:

@@ -1,15 +1,15 @@
-"""Read RGB-D recordings of the layouts people have. [host]
+"""Read RGB-D recordings in common layouts. [host]
 
 A layout is two functions: whether a folder `fits` it, and one that lists the files of each frame.
-Images are read, and checked, one frame at a time when asked for, so a long sequence never fills the
+Images are read and checked one frame at a time, on request, so a long sequence never fills the
 memory. In the order of data: `frames` (what is read), `text`, `poses`, `trajectories`, `cameras`,
 `listing` (which images belong together), the room `layouts` with a file for each kind of recording,
 `unread` (files without use), `conventions` (other ways to write poses and depth), `evidence` (the
 agreement of poses and images), `hypotheses` (the conventions under which they agree), `figures` and
 `inspection` (statistics and warnings of a recording).
 
-Depth images and colour images are taken as registered: of one camera, as all these layouts promise.
-A colour image of another size but the same aspect is scaled to the depth image.
+Depth images and colour images are assumed to be registered to one camera, as all these layouts
+promise. A colour image of another size but the same aspect is scaled to the depth image.
 """
 
 from collections.abc import Callable
@@ -64,7 +64,7 @@ class Layout(NamedTuple):
     """One kind of recording on disk.
 
     Attributes:
-        needs: The files it cannot do without, in a few words.
+        needs: The files that it requires, in a few words.
         fits: Whether a folder is of this layout.
         list_frames: Lists the files of each frame of a folder.
     """
@@ -98,7 +98,7 @@ LAYOUTS: dict[str, Layout] = {
 """Layouts in the order in which they are tried: the last fits any folder with depth images."""
 
 FILES = (".npz", ".r3d")
-"""Ends of the files that can be a recording by themselves."""
+"""Suffixes of files that are a recording by themselves."""
 
 
 def open_sequence(
@@ -106,12 +106,12 @@ def open_sequence(
 ) -> Sequence:
     """Open a folder of RGB-D frames without reading its images. [host]
 
-    Images and poses are checked when their frame is read. Where the folder holds no camera, the
-    usual camera of such recordings is taken; `findings` say so if that is a guess.
+    Images and poses are checked when their frame is read. If the folder holds no camera, the usual
+    camera of such recordings is used; `findings` tell if this is a guess.
 
     Args:
         path: Folder of the recording, or an `.npz` file of arrays.
-        depth_scale: Depth units in a metre, above 0; None for the scale of the layout.
+        depth_scale: Depth units per metre, above 0; None for the scale of the layout.
         layout: Name of the layout, a key of `LAYOUTS`; None for the first that fits.
 
     Returns:
@@ -199,7 +199,7 @@ def _nothing_fits(contents: Contents) -> str:
 
 
 def _fitting_nearby(contents: Contents) -> Path | None:
-    """A folder that fits: two levels of sub-folders, the first of many, then the parent."""
+    """A folder that fits, among the first sub-folders at two levels, then the parent."""
     below = _subfolders(contents.folder)
     deeper = (two for one in below for two in _subfolders(one))
     nearby = (*below, *islice(deeper, 200), contents.folder.resolve().parent)
@@ -207,7 +207,7 @@ def _fitting_nearby(contents: Contents) -> Path | None:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    with suppress(OSError):  # not ours to read
+    with suppress(OSError):  # no permission to read it
         return [folder / name for name in sorted(list_folder(folder).folders)[:50]]
     return []
 
@@ -264,7 +264,7 @@ def _without_other_colors(
     first = next((files.color for files in listed.files if files.color), None)
     try:
         seen = read_shape(first) if first else shape
-    except SequenceError:  # a damaged image says nothing of the others
+    except SequenceError:  # one damaged image tells nothing about the others
         seen = shape
     if same_aspect(seen, shape):
         return listed.files, ()

@@ -1,8 +1,9 @@
-"""Intrinsics of a recording: from its files, or the known values of its kind of camera.
+"""Intrinsics of a recording: from its files, or known values of its kind of camera.
 
-Ours put the centre of pixel (row, column) at (column + 0.5, row + 0.5); so does
+Our intrinsics put the centre of pixel (row, column) at (column + 0.5, row + 0.5). So does
 `camera-intrinsics.txt`, whose 640 x 480 images have their centre at 320, 240. OpenCV, and with it
-TUM, Open3D, Redwood and `cam_K.txt`, put it at (column, row), so theirs get half a pixel more.
+TUM, Open3D, Redwood and `cam_K.txt`, put it at (column, row): half a pixel is added to their
+principal points.
 """
 
 import re
@@ -35,13 +36,13 @@ class Camera(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """Cameras that a recording's own files give, of images of some size.
+    """Cameras from the files of a recording, for images of a given size.
 
     Attributes:
-        matrices: Camera matrix of each frame, or one of all `[n 3 3]`, in pixels, where column j
+        matrices: Camera matrix of each frame, or one for all `[n 3 3]`, in pixels, where column j
             covers u in [j, j + 1).
-        shape: Height and width of the images they are of, in pixels; None for the size of the depth
-            images.
+        shape: Height and width of the images of these cameras, in pixels; None for the size of the
+            depth images.
         source: Source of the cameras.
     """
 
@@ -51,12 +52,13 @@ class Calibration(NamedTuple):
 
 
 class DefaultCamera(NamedTuple):
-    """The camera that a kind of recording is known to be made with.
+    """The camera that is known to be used for a kind of recording.
 
     Attributes:
-        numbers: fx, fy, cx, cy in OpenCV's pixels, of 640 x 480 images.
+        numbers: fx, fy, cx, cy in OpenCV's pixel coordinates, for 640 x 480 images.
         source: Source of the numbers.
-        sure: Whether the camera was calibrated for this very recording, or is a guess.
+        sure: Whether the camera is known to be that of this very recording; otherwise it is a
+            guess.
     """
 
     numbers: tuple[float, float, float, float]
@@ -65,15 +67,15 @@ class DefaultCamera(NamedTuple):
 
 
 PRIMESENSE = (525.0, 525.0, 319.5, 239.5)
-"""Kinect 1 and Asus Xtion as their driver gives them, and the default of ROS and Open3D."""
+"""Default of the drivers of Kinect 1 and Asus Xtion, and of ROS and Open3D."""
 
 
 def find_camera(folder: Path, names: Iterable[str], shape: tuple[int, int]) -> Camera | None:
-    """The camera that lies in a folder, which holds `names`, or in its parent; None without one.
+    """The camera file in a folder with the files `names`, or in its parent; None without one.
 
-    `camera-intrinsics.txt` or `cam_K.txt` (3x3), `calibration.txt` (fx fy cx cy), or a camera or
-    trajectory of Open3D, with "camera", "intrinsic" or "traj" in its name, scaled to `shape` if it
-    is of another size.
+    It may be `camera-intrinsics.txt` or `cam_K.txt` (3x3), `calibration.txt` (fx fy cx cy), or a
+    camera or trajectory of Open3D with "camera", "intrinsic" or "traj" in its name, which is scaled
+    to `shape` if its size differs.
     """
     for name in sorted(names, key=lambda name: ("traj" in name, name)):
         if name in _FILES:
@@ -92,7 +94,7 @@ def _camera(K: Matrix, path: Path, shape: tuple[int, int]) -> Camera:
 
 
 def scaled_cameras(calibration: Calibration, shape: tuple[int, int]) -> Float[np.ndarray, "n 3 3"]:
-    """The cameras of a calibration, for images of `shape`; `SequenceError` if they are not."""
+    """Cameras of a calibration, scaled to images of `shape`; `SequenceError` if they do not fit."""
     height, width = calibration.shape or shape
     if not (height > 0 and width > 0 and same_aspect((height, width), shape)):
         raise SequenceError(
@@ -105,7 +107,7 @@ def scaled_cameras(calibration: Calibration, shape: tuple[int, int]) -> Float[np
 
 
 def matrices_of(fx: Any, fy: Any, cx: Any, cy: Any) -> Float[np.ndarray, "n 3 3"]:
-    """Camera matrices from their numbers, each one number or one of each frame."""
+    """Camera matrices from their parameters, each one number or one per frame."""
     fx, fy, cx, cy = np.broadcast_arrays(*(np.atleast_1d(one) for one in (fx, fy, cx, cy)))
     matrices = np.tile(np.eye(3), (len(fx), 1, 1))
     matrices[:, 0, 0], matrices[:, 1, 1] = fx, fy
@@ -114,7 +116,7 @@ def matrices_of(fx: Any, fy: Any, cx: Any, cy: Any) -> Float[np.ndarray, "n 3 3"
 
 
 def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int]) -> Camera:
-    """A known camera, scaled to images of `shape`; `SequenceError` if it cannot have made them."""
+    """A known camera, scaled to images of `shape`; `SequenceError` if the aspect differs."""
     if not same_aspect(shape, (480, 640)):
         raise SequenceError(
             f"{folder} holds no camera, and {default.source} makes images of 640 x 480, "
@@ -219,7 +221,7 @@ def _checked(K: Matrix, path: Path | str, shape: tuple[int, int]) -> Matrix:
             "would be wider than 160 degrees or narrower than 1: expected them in pixels; write "
             "fx 0 cx / 0 fy cy / 0 0 1."
         )
-    # Within the middle 90 %, since a matrix for images of twice the size puts it at the corner.
+    # Within the middle 90 %, since a matrix for images of twice the size would put it at a corner.
     if not all(0.05 < c / n < 0.95 for c, n in ((cx, w), (cy, h))):
         raise SequenceError(
             f"{path} has its principal point at {cx:g}, {cy:g}; expected it well "

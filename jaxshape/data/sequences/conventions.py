@@ -1,4 +1,4 @@
-"""Other conventions in which recordings are written, by name, and how each is turned into ours.
+"""Other conventions in which recordings are written, by name, and their conversion into ours.
 
 Ours: T_world_camera in metres, x right, y down, z forward; quaternions x y z w; depth along z.
 """
@@ -20,14 +20,14 @@ Depth = Float[np.ndarray, "h w"]
 Matrix = Float[np.ndarray, "3 3"]
 
 AS_GIVEN = "as-given"
-"""The name that stands for our own convention, where it is stated and not found."""
+"""Name of our own convention, for users who state it instead of having it detected."""
 
 
 class Rule(NamedTuple):
     """A convention of poses or of depth images.
 
     Attributes:
-        meaning: A sentence without its full stop, for people.
+        meaning: A human-readable sentence without its full stop.
         to_ours: Function from a pose, or a depth image and its camera matrix, to our convention.
     """
 
@@ -80,13 +80,13 @@ POSE_RULES = {
     "inverted": Rule("poses map world to camera", np.linalg.inv),
     "opengl": Rule("cameras look along -z with y up, as in OpenGL, ARKit and NeRF", _from_opengl),
 }
-"""Conventions of poses, in the order in which they are undone."""
+"""Conventions of poses, in the order in which they are converted."""
 
 DEPTH_RULES = {
     "mirrored": Rule("depth images are mirrored left to right", _from_mirrored),
     "ray": Rule("depth is measured along each ray, not along z", _from_ray),
 }
-"""Conventions of depth images, in the order in which they are undone."""
+"""Conventions of depth images, in the order in which they are converted."""
 
 CONVENTIONS = (*POSE_RULES, *DEPTH_RULES)
 """Names of all conventions."""
@@ -98,7 +98,7 @@ class Convention:
 
     Attributes:
         names: Names, among `CONVENTIONS`, of the differences from ours; empty for our own.
-        depth_scale: Depth units in a metre, above 0; None for the scale of the recording.
+        depth_scale: Depth units per metre, above 0; None for the scale of the recording.
     """
 
     names: tuple[str, ...] = ()
@@ -169,7 +169,7 @@ def read_as(sequence: Sequence, convention: Convention) -> Sequence:
 
 
 def _pose(read: Callable[[int], Pose | None], names: tuple[str, ...], index: int) -> Pose | None:
-    """A pose in our convention; a matrix stored by columns is put right as a whole."""
+    """A pose in our convention; a matrix stored by columns is transposed as a whole."""
     try:
         T = read(index)
     except StoredByColumns as stored:

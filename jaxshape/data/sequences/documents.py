@@ -1,4 +1,4 @@
-"""Text that comes with a recording, and the files it names: bounded, and inside the recording."""
+"""Text files of a recording, with limits, and the files that they name inside the recording."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,7 +13,7 @@ from jaxshape.data.sequences.text import number, words_of
 
 
 def read_document(path: Path) -> str:
-    """Read a text, as `reading.read_text`; `SequenceError` if that cannot be done."""
+    """Read a text like `reading.read_text`; `SequenceError` if that fails."""
     try:
         return reading.read_text(path)
     except (OSError, ValueError) as error:
@@ -58,9 +58,9 @@ def shape_of(height: Any, width: Any, source: object) -> tuple[int, int]:
 
 
 def rows_of(path: Path, columns: Iterable[int]) -> list[list[float]]:
-    """Rows of numbers of a text file, each with one of the numbers of `columns`.
+    """Rows of numbers of a text file; the length of each row must be in `columns`.
 
-    Comments, and commas and brackets between the numbers, are passed over.
+    Comments, and commas and brackets between the numbers, are ignored.
     """
     wanted = tuple(columns)
     rows = []
@@ -81,9 +81,9 @@ def rows_of(path: Path, columns: Iterable[int]) -> list[list[float]]:
 
 
 def below(folder: Path, name: Any, source: Path) -> Path:
-    """The file that a text names, which has to lie below the folder of the recording.
+    """The file that a text names, which must be below the folder of the recording.
 
-    Links are followed first, so that a recording cannot have a file read that is not its own.
+    Links are resolved first, so that a recording cannot make the reader open files outside it.
     """
     if not isinstance(name, str) or "\0" in name or len(name) > limits.PATH_LENGTH:
         raise SequenceError(

@@ -1,4 +1,4 @@
-"""Agreement of poses and depth images: whether neighbouring frames see a surface at one place."""
+"""Agreement of poses and depth images: whether neighbouring frames show a surface in one place."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -15,14 +15,14 @@ from jaxshape.data.sequences.poses import StoredByColumns
 Pose = Float[np.ndarray, "4 4"]
 
 TOLERANCE = 0.02
-"""Share of the depth within which two frames see the same surface."""
+"""Relative difference of depth up to which two frames see the same surface."""
 
 STRIDES = (1, 2, 4, 8, 16, 30, 60)
-"""Frames between the two of a pair, of which the first is taken that tells."""
+"""Distances between the frames of a pair; the first one with clear motion is used."""
 
 MOVED, HARDLY_MOVED = 0.5, 0.85
-"""Agreement as if the camera had not moved, below which a pair tells much of the motion; and
-below which pairs are taken where no pair of the recording tells much."""
+"""Thresholds on the agreement that a pair would have without motion: below the first, its motion is
+clear; below the second, it is used if the recording has no pair with clear motion."""
 
 
 class Pair(NamedTuple):
@@ -30,11 +30,11 @@ class Pair(NamedTuple):
 
     Attributes:
         depth_a: Depth of the first frame `[h w]`, in metres; 0 where nothing was measured.
-        depth_b: Depth of the second frame, alike.
+        depth_b: Depth of the second frame, in the same form.
         T_a: Pose of the first frame `[4 4]`, as it is written.
-        T_b: Pose of the second frame, alike.
+        T_b: Pose of the second frame, in the same form.
         K_a: Camera matrix of the first frame `[3 3]`, in pixels.
-        K_b: Camera matrix of the second frame, alike.
+        K_b: Camera matrix of the second frame, in the same form.
         by_columns: Whether the matrices are stored by columns, and were transposed as a whole.
     """
 
@@ -62,14 +62,14 @@ class ConvertedPair(NamedTuple):
 
 
 def telling_pairs(sequence: Sequence, *, count: int = 8) -> tuple[Pair, ...]:
-    """Pairs of frames from all over a recording between which the camera clearly moved.
+    """Pairs of frames, spread over a recording, between which the camera clearly moved.
 
-    The motion is judged by the depth images alone, independent of the convention of the poses.
-    Frames without a pose, or that cannot be read, are passed over.
+    Only the depth images decide whether it moved, independent of the convention of the poses.
+    Frames that have no pose, or cannot be read, are skipped.
 
     Args:
         sequence: The recording; its poses and depth images are taken as they are written.
-        count: Pairs that are looked for, 1 or more.
+        count: Number of pairs to look for, 1 or more.
     """
     read = lru_cache(maxsize=2)(lambda index: _depth(sequence, index))
     firsts = np.unique(np.linspace(0, max(0, len(sequence) - 2), count, dtype=int))
@@ -81,8 +81,8 @@ def telling_pairs(sequence: Sequence, *, count: int = 8) -> tuple[Pair, ...]:
 def _most_telling(
     sequence: Sequence, first: int, read: Callable[[int], Float[np.ndarray, "h w"] | None]
 ) -> tuple[float, Pair] | None:
-    """The nearest frame with clear motion, otherwise the frame with most motion; with the share of
-    pixels that did not move."""
+    """Pair with the nearest frame with clear motion, otherwise with the frame with most motion, and
+    the share of pixels that did not move."""
     a, pose_a, best = read(first), _pose(sequence, first), None
     if a is None or pose_a is None:
         return None
@@ -103,7 +103,7 @@ def _most_telling(
 
 
 def _depth(sequence: Sequence, index: int) -> Float[np.ndarray, "h w"] | None:
-    """A depth image at the depth scale of the recording, plausible or not; None if damaged."""
+    """A depth image at the depth scale of the recording, even if implausible; None if damaged."""
     with suppress(SequenceError):  # reading the frame reports it
         raw = read_raw_depth(sequence.files[index].depth, sequence.shape)
         valid = (raw > 0) & (raw < SATURATED)
@@ -126,14 +126,14 @@ def _pose(sequence: Sequence, index: int) -> tuple[Pose, bool] | None:
 
 
 def stored_by_columns(sequence: Sequence) -> bool:
-    """Whether a pose of the recording, of some from all over, is a matrix stored by columns."""
+    """Whether one of some sampled poses of the recording is a matrix stored by columns."""
     some = np.unique(np.linspace(0, len(sequence) - 1, 8, dtype=int))
     poses = (_pose(sequence, int(index)) for index in some)
     return any(pose is not None and pose[1] for pose in poses)
 
 
 def seen_by(pairs: tuple[Pair, ...], names: tuple[str, ...] = ()) -> tuple[ConvertedPair, ...]:
-    """The pairs with depth images that are taken as written in these conventions.
+    """The pairs with depth images converted from these conventions.
 
     Args:
         pairs: The pairs.
@@ -157,16 +157,16 @@ def agreement(
     longer: float = 1.0,
     tolerance: float = TOLERANCE,
 ) -> float:
-    """Mean share, over pairs, of the pixels that the second frame sees at the same place.
+    """Mean share, over pairs, of the pixels that the second frame sees in the same place.
 
-    A pixel counts where the second frame measured something at its place, but at least half of all
-    pixels count, so that poses which turn the camera away win nothing.
+    The share is over pixels at which the second frame measured something, but over at least half of
+    all pixels, so that poses which turn the camera away gain nothing.
 
     Args:
         seen: The pairs, with depth images in our convention.
-        names: Names of conventions in which the poses are taken as written.
+        names: Names of conventions from which the poses are converted.
         longer: Factor on the depth scale, by which the depths are divided.
-        tolerance: Share of the depth within which two frames see the same surface.
+        tolerance: Relative difference of depth up to which two frames see the same surface.
 
     Returns:
         From 0 to 1; 0 without a pair.
@@ -175,13 +175,13 @@ def agreement(
     for points, depth, pair in seen:
         undo = tuple(name for name in names if not (pair.by_columns and name == "transposed"))
         T_b_a = np.linalg.inv(our_pose(pair.T_b, undo)) @ our_pose(pair.T_a, undo)
-        T_b_a[:3, 3] *= longer  # instead of all depths by its inverse
+        T_b_a[:3, 3] *= longer  # instead of dividing all depths by it
         shares.append(_same_surface(points, depth, pair.K_b, T_b_a, tolerance))
     return float(np.mean(shares)) if shares else 0.0
 
 
 def _points(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]):
-    """Some points of a depth image, in its camera `[3 n]`."""
+    """A sample of the points of a depth image, in its camera frame `[3 n]`."""
     step = max(1, depth.shape[1] // 40)
     row, column = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
     row, column = row * step + step // 2, column * step + step // 2
@@ -196,7 +196,7 @@ def _same_surface(
     T_b_a: Pose,
     tolerance: float,
 ) -> float:
-    """Share of the points of `a` which, moved to `b`, lie within the tolerance of its depth."""
+    """Share of the points of `a` that, moved to `b`, are within the tolerance of its depth."""
     u, v, z = K @ (T_b_a[:3, :3] @ points + T_b_a[:3, 3:])
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         column, row = np.floor(u / z), np.floor(v / z)

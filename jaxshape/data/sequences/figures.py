@@ -1,4 +1,4 @@
-"""Figures of a recording: of its poses, names and times, and of some of its images."""
+"""Statistics of a recording: of its poses, names and times, and of a sample of its images."""
 
 import math
 from typing import NamedTuple
@@ -40,10 +40,10 @@ class Depths(NamedTuple):
 
     Attributes:
         median: Median depth of the valid pixels, in metres; 0 if there are none.
-        invalid: Share of pixels that hold nothing, saturated ones included, from 0 to 1.
+        invalid: Share of pixels without depth, including saturated ones, from 0 to 1.
         saturated: Share of pixels that are saturated, from 0 to 1.
-        sampled: Images that could be read.
-        black: Images of these that hold no valid pixel.
+        sampled: Number of sampled images that could be read.
+        black: Number of these images without any valid pixel.
         damaged: A sentence for each image that could not be read.
     """
 
@@ -63,7 +63,7 @@ class Poses(NamedTuple):
         length: Length of the camera's path between frames with poses, in metres.
         reading: Agreement of the poses with the depth images, as written and in other conventions.
         damaged: A sentence for each pose that cannot be used.
-        is_used: Whether the best convention of `reading` is that in which the recording is read.
+        is_used: Whether the recording is read in the best convention of `reading`.
     """
 
     known: int
@@ -80,7 +80,7 @@ class Poses(NamedTuple):
 
 
 def depths_of(sequence: Sequence) -> Depths:
-    """Figures of some depth images; raises the `SequenceError` of the first if none can be read."""
+    """Statistics of sampled depth images; raises the first `SequenceError` if none can be read."""
     raw, damaged = [], []
     for index in _sampled(sequence):
         try:
@@ -102,13 +102,13 @@ def depths_of(sequence: Sequence) -> Depths:
 
 
 def _thinned(pixels: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Every n-th pixel of an image, a million at most: figures need no more."""
+    """Every n-th pixel of an image, at most a million, which is enough for statistics."""
     every = math.ceil(math.sqrt(pixels.size / 1e6))
     return pixels[::every, ::every].copy()
 
 
 def poses_of(sequence: Sequence, reading: Reading) -> Poses:
-    """Read all poses of a recording, of which it is known how they may be read."""
+    """Read all poses of a recording, and combine their statistics with `reading`."""
     places, damaged = [], []
     for index in range(len(sequence)):
         try:
@@ -126,7 +126,7 @@ def poses_of(sequence: Sequence, reading: Reading) -> Poses:
 
 
 def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
-    """A sentence for each colour image or mask, of some, that cannot be used."""
+    """A sentence for each sampled colour image or mask that cannot be used."""
     damaged = []
     for index in _sampled(sequence):
         files = sequence.files[index]
@@ -144,12 +144,12 @@ def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:
     """Gaps between frames, by the times of the frames, or without times by the numbers in their
     names.
 
-    A step between frames is a gap when it is half as long again as the usual one.
+    A step between frames is a gap if it is more than 1.5 times the usual step.
     """
     names = sequence.names
     steps = np.diff(_numbers(names) if sequence.times is None else sequence.times)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    if usual < 1e-9:  # names that do not count
+    if usual < 1e-9:  # the numbers in the names do not increase
         return ()
     return tuple(
         Gap(names[i], names[i + 1], max(1, round(steps[i] / usual) - 1))
@@ -163,7 +163,7 @@ def _numbers(names: tuple[str, ...]) -> Float[np.ndarray, " n"]:
 
 
 def rate_of(sequence: Sequence) -> float | None:
-    """Depth images a second; None without times."""
+    """Depth images per second; None without times."""
     steps = np.diff(sequence.times) if sequence.times is not None else np.zeros(0)
     usual = float(np.median(steps)) if len(steps) else 0.0
     return 1 / usual if usual >= 1e-9 else None

@@ -1,4 +1,4 @@
-"""Frames of an RGB-D recording, read and checked one at a time, when they are asked for."""
+"""Frames of an RGB-D recording, read and checked one at a time, on request."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,19 +15,19 @@ from jaxshape.data.sequences.errors import SequenceError as SequenceError
 from jaxshape.data.sequences.rasters import Picture, open_picture
 
 SATURATED = 65535
-"""The value that depth cameras write where they measured nothing sure; read as 0, unknown."""
+"""The value that depth cameras write where they have no reliable depth; read as 0, unknown."""
 
 USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
-"""Depth units per metre that people use."""
+"""Common depth units per metre."""
 
-_PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: what depth cameras reach, with room to spare
+_PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: the range of depth cameras, with a margin
 _USUAL_MEDIAN_DEPTH = 2.0  # metres: an object in a room
 
 _INSTANCE, _NUMBERED = 1e-3, 0.95
-"""Share of an image that the pixels of an object fill at least, and share of the pixels of a mask
-that numbered objects fill together."""
+"""Least share of an image that an object in a numbered mask fills, and least share of the mask's
+pixels that all numbered objects fill together."""
 
-_CONFIDENT = 1  # of 0, 1 and 2, as ARKit rates its depths: 0 is a guess
+_CONFIDENT = 1  # of ARKit's ratings 0, 1 and 2 of depths: 0 is a guess
 
 
 class Finding(NamedTuple):
@@ -54,16 +54,16 @@ class Frame(NamedTuple):
         name: Name of the frame, from its files.
         depth: Depth along the optical axis `[h w]`, in metres, float32; 0 where nothing was
             measured.
-        color: Colour at the pixels of `depth` `[h w 3]`, scaled to its size; None where there is no
-            colour image.
-        T_world_camera: Pose of the camera `[4 4]`; None where no pose was given, or the recorder's
+        color: Colour at the pixels of `depth` `[h w 3]`, scaled to its size; None without a colour
+            image.
+        T_world_camera: Pose of the camera `[4 4]`; None if no pose is given, or if the recorder's
             own tracking was lost.
-        mask: True on the object `[h w]`; None where no mask was given.
+        mask: True on the object `[h w]`; None if no mask is given.
         intrinsics: Camera matrix of this frame `[3 3]`, in pixels.
-        time: Time of the depth image from any start, in seconds; None where the recording does not
-            tell.
-        instances: Number of the object that each pixel shows `[h w]`, 0 for none; None where the
-            mask does not number several objects.
+        time: Time of the depth image from any start, in seconds; None if the recording has no
+            times.
+        instances: Number of the object that each pixel shows `[h w]`, 0 for none; None if the mask
+            does not number several objects.
     """
 
     name: str
@@ -106,25 +106,25 @@ class Sequence:
 
     Attributes:
         layout: Name of the layout on disk, a key of `LAYOUTS`.
-        intrinsics: Camera matrix of all depth images, or of the first where each has its own
-            `[3 3]`, in pixels, where column j covers u in [j, j + 1).
+        intrinsics: Camera matrix `[3 3]` of all depth images, or of the first if each has its own,
+            in pixels, where column j covers u in [j, j + 1).
         camera: Source of the intrinsics.
         files: Files of each frame.
-        read_pose: Index of a frame, from 0, to its T_world_camera `[4 4]`, checked; None where
-            there is none.
-        has_poses: Whether poses were given, though perhaps not for every frame.
+        read_pose: Function from the index of a frame, from 0, to its T_world_camera `[4 4]`,
+            checked; it returns None for a frame without a pose.
+        has_poses: Whether poses are given, perhaps not for every frame.
         shape: Height and width of all images when read, in pixels.
-        depth_scale: Depth units in a metre, above 0.
-        times: Times of the depth images `[n]`, in seconds; None where the recording does not tell.
-        color_delays: Seconds from a depth image to its colour image `[n]`, NaN where it has none;
-            None without times.
+        depth_scale: Depth units per metre, above 0.
+        times: Times of the depth images `[n]`, in seconds; None if the recording has no times.
+        color_delays: Seconds from a depth image to its colour image `[n]`, NaN if it has none; None
+            without times.
         findings: Remarks made on opening that a user should know.
-        cameras: Camera matrix of each depth image `[n 3 3]`, in pixels; None where all images share
+        cameras: Camera matrix of each depth image `[n 3 3]`, in pixels; None if all images share
             `intrinsics`.
         camera_is_guess: Whether the recording holds no camera, so that the usual camera of such
-            recordings is taken.
-        correct_depth: Function from a depth image as it is written, in metres, and its camera
-            matrix to depth along the optical axis; None where no correction is needed.
+            recordings is used.
+        correct_depth: Function from a depth image as written, in metres, and its camera matrix to
+            depth along the optical axis; None if no correction is needed.
     """
 
     layout: str
@@ -198,12 +198,12 @@ class Sequence:
 def read_depth(
     path: Picture, shape: tuple[int, int], *, depth_scale: float
 ) -> Float[np.ndarray, "h w"]:
-    """Read a depth image as metres in float32; 0 where it holds 0, 65535 or nothing finite.
+    """Read a depth image as metres in float32; values 0 and 65535, and not finite ones, become 0.
 
     Args:
         path: The image.
         shape: Height and width that it must have, in pixels.
-        depth_scale: Depth units in a metre.
+        depth_scale: Depth units per metre.
 
     Raises:
         SequenceError: The image is damaged, of 8 bits, in colour or of another size, or its median
@@ -234,16 +234,16 @@ def read_raw_depth(path: Picture, shape: tuple[int, int]) -> Float[np.ndarray, "
 
 
 def usual_depth_scale(pictures: Iterable[Picture]) -> float:
-    """Depth units in a metre where nothing says them: floats are metres, integers millimetres."""
+    """Default depth units per metre: floats are metres, integers millimetres."""
     for picture in islice(pictures, 20):
-        # A damaged one says nothing.
+        # A damaged image tells nothing.
         with suppress(SequenceError), opened(picture, limits.DEPTH_PIXELS) as image:
             return 1.0 if image.mode == "F" else 1000.0
     return 1000.0
 
 
 def _read_confident(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Where a map of confidences says that a depth is more than a guess."""
+    """True where a confidence map rates a depth as more than a guess."""
     with opened(path) as image:
         _check_aspect(image, shape, path)
         pixels = np.array(image.resize((shape[1], shape[0]), Image.Resampling.NEAREST))
@@ -253,7 +253,7 @@ def _read_confident(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "
 
 
 def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
-    """A remark on the depth scale where a median depth, in metres, is implausible."""
+    """A remark on the depth scale if a median depth, in metres, is implausible."""
     low, high = _PLAUSIBLE_MEDIAN_DEPTH
     if low <= median <= high:
         return None
@@ -265,8 +265,7 @@ def depth_scale_fault(median: float, depth_scale: float) -> Finding | None:
 
 
 def likely_depth_scales(median: float, depth_scale: float) -> str:
-    """The usual scales at which a median depth becomes plausible for an object in a room, in
-    words."""
+    """The common scales at which a median depth is plausible for an object in a room, in words."""
     usual = median * depth_scale / _USUAL_MEDIAN_DEPTH
     distance = {scale: abs(np.log(scale / usual)) for scale in USUAL_DEPTH_SCALES}
     nearest = min(distance, key=distance.__getitem__)
@@ -294,15 +293,15 @@ def read_color(path: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 
 
 
 def read_mask(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Read where an image is not black, scaled to `shape`; raises as `read_color` does."""
+    """Read a mask, True where not black, scaled to `shape`; raises as `read_color` does."""
     pixels = _mask_pixels(path, shape)
     return pixels != 0 if pixels.ndim == 2 else (pixels != 0).any(axis=-1)
 
 
 def read_instances(path: Picture, shape: tuple[int, int]) -> Int[np.ndarray, "h w"] | None:
-    """Read the numbers of objects in a mask; None where it holds no more than one.
+    """Read the numbers of objects in a mask; None if it holds at most one object.
 
-    The rim of a mask that was scaled holds many values, none of them on many pixels.
+    The edges of a mask that was scaled have many different values, each on few pixels.
     """
     pixels = _mask_pixels(path, shape)
     if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
@@ -331,7 +330,7 @@ def _check_aspect(image: Image.Image, shape: tuple[int, int], path: Picture) -> 
 
 
 def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Whether images of two sizes can show the same, one scaled: their aspects differ by 2 %."""
+    """Whether one image can be a scaled version of another: their aspects differ by at most 2 %."""
     return abs(a[0] * b[1] - a[1] * b[0]) <= 0.02 * a[1] * b[0]
 
 
@@ -347,7 +346,7 @@ def opened(path: Picture, most: int = limits.COLOR_PIXELS) -> Iterator[Image.Ima
             yield image
     except (SequenceError, MemoryError):
         raise
-    except Exception as error:  # decoders of damaged files fail in any way there is
+    except Exception as error:  # decoders of damaged files may raise anything
         raise SequenceError(
             f"{path} cannot be read as an image ({error}); expected a whole image file: copy it "
             "again from its source, or remove the frame."

@@ -1,4 +1,4 @@
-"""The convention of a recording, found by the agreement of its poses with its depth images."""
+"""Detect the convention of a recording by the agreement of its poses with its depth images."""
 
 from collections.abc import Iterator
 from itertools import combinations
@@ -19,27 +19,28 @@ from jaxshape.data.sequences.evidence import (
 from jaxshape.data.sequences.frames import USUAL_DEPTH_SCALES, Sequence
 
 FITS = 0.7
-"""Agreement from which a convention fits; with noise and occlusion, correct poses have .8 to
+"""Smallest agreement of a convention that fits; with noise and occlusion, correct poses have .8 to
 .99."""
 
 GOOD = 0.9
-"""Agreement below which conventions that differ in more than one thing are tried, too."""
+"""Agreement below which conventions with several differences are also tried."""
 
 SURE, DOUBT = 3.0, 2.0
-"""Factors by which another convention must reduce the disagreeing pixels: to be used without being
-asked for, and to be named."""
+"""Factors by which another convention must reduce the number of disagreeing pixels: to be used
+automatically, and to be suggested."""
 
 FINE, FINER = 0.01, 1.5
-"""Tolerance at which similar depth scales are compared, and the factor, as `DOUBT`, from which one
-is named: with 1200 units read as 1000, 94 % agree to 2 %, and 76 % to 1 %, not 86 %."""
+"""Tolerance at which similar depth scales are compared, and the factor, like `DOUBT`, from which
+one is suggested: if 1200 units are read as 1000, 94 % of the pixels agree to 2 %, and 76 % to 1 %
+instead of 86 %."""
 
 LEAST = 0.05
-"""Least gain of agreement for another convention to be used or named."""
+"""Least gain of agreement for another convention to be used or suggested."""
 
 SIMPLE = 0.03
 """Loss of agreement allowed for a simpler convention."""
 
-_DEPTHS = (0.3, 7.0)  # metres: median depths at which a depth scale is believed
+_DEPTHS = (0.3, 7.0)  # metres: range of plausible median depths
 _APART = (("centimetres", "millimetres"), ("wxyz", "transposed"))  # never both
 
 
@@ -60,11 +61,11 @@ class Reading(NamedTuple):
 
     Attributes:
         given: Agreement of poses and depth images as they are written, from 0 to 1.
-        pairs: Pairs of frames that were compared; without any, nothing is known.
+        pairs: Number of pairs of frames that were compared; with 0, nothing is known.
         best: The convention that fits best; None if no other is better than the written one.
         rival: Another convention that is equally simple and fits nearly as well; None without one.
-        by_columns: Whether matrices are stored by columns, of which there is no doubt.
-        tolerance: Share of the depth to which pixels had to agree.
+        by_columns: Whether matrices are certainly stored by columns.
+        tolerance: Relative difference of depth up to which pixels agree.
     """
 
     given: float
@@ -76,7 +77,7 @@ class Reading(NamedTuple):
 
     @property
     def is_sure(self) -> bool:
-        """Whether the evidence for the best convention is overwhelming."""
+        """Whether the evidence suffices to use the best convention automatically."""
         if self.best is None:
             return False
         if self.by_columns and self.best.convention.names == ("transposed",):
@@ -89,7 +90,7 @@ def reading_of(sequence: Sequence, median: float) -> Reading:
     """Compare the conventions in which a recording may be written.
 
     Args:
-        sequence: The recording, read as it is written.
+        sequence: The recording, read as written.
         median: Median depth of the recording, in metres.
     """
     pairs = telling_pairs(sequence)
@@ -109,7 +110,7 @@ def reading_of(sequence: Sequence, median: float) -> Reading:
 
 
 class _Search:
-    """Shares of a recording's pairs under conventions, with depth images turned only once."""
+    """Agreement of a recording's pairs under conventions; depth images are converted only once."""
 
     def __init__(self, pairs: tuple[Pair, ...], sequence: Sequence, median: float) -> None:
         self.own, self.median = sequence.depth_scale, median
@@ -126,7 +127,7 @@ class _Search:
         return agreement(seen, names, longer=longer, tolerance=tolerance)
 
     def simple(self, by_columns: bool) -> Iterator[Hypothesis]:
-        """Conventions that differ from ours in one thing."""
+        """Conventions with one difference from ours."""
         base = ("transposed",) * by_columns
         for names in (base,) if base else ((name,) for name in CONVENTIONS):
             if self.is_plausible(names):
@@ -135,7 +136,7 @@ class _Search:
             yield from self.scaled(())
 
     def combined(self, by_columns: bool) -> Iterator[Hypothesis]:
-        """Conventions that differ in two or three things."""
+        """Conventions with two or three differences from ours."""
         for count in (2, 3):
             for names in combinations(CONVENTIONS, count):
                 apart = any(set(pair) <= set(names) for pair in _APART)
@@ -148,7 +149,7 @@ class _Search:
                 yield from self.scaled(names)
 
     def finer(self) -> Reading | None:
-        """A depth scale that differs little, and is better at a smaller tolerance alone."""
+        """A slightly different depth scale that is better only at a smaller tolerance."""
         given = self.share((), tolerance=FINE)
         for convention, _ in self.scaled(()):
             share = self.share((), (convention.depth_scale or self.own) / self.own, FINE)
@@ -159,12 +160,12 @@ class _Search:
         return None
 
     def is_plausible(self, names: tuple[str, ...]) -> bool:
-        """Units of poses are doubted only where the depth scale makes sense: they do the same."""
+        """Other units of poses are tried only if the depth scale is plausible: both act alike."""
         has_unit = any(name.endswith("metres") for name in names)
         return not has_unit or _DEPTHS[0] <= self.median <= _DEPTHS[1]
 
     def scaled(self, names: tuple[str, ...]) -> Iterator[Hypothesis]:
-        """The best depth scale of all, a usual one where the poses cannot tell it from that."""
+        """The best depth scale, or a common one if the poses cannot distinguish the two."""
         if not self.pairs or self.median <= 0:
             return
         low, high = (self.median * self.own / depth for depth in reversed(_DEPTHS))
@@ -189,7 +190,7 @@ def _is_better(share: float, other: float, factor: float) -> bool:
 
 
 def _changes(one: Hypothesis) -> int:
-    """In how many things a convention differs from ours."""
+    """Number of differences of a convention from ours."""
     return len(one.convention.names) + (one.convention.depth_scale is not None)
 
 

@@ -1,4 +1,4 @@
-"""Inspection of a recording: its figures, and warnings with their evidence."""
+"""Inspection of a recording: its statistics, and warnings with their evidence."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from jaxshape.data.sequences.frames import (
 )
 from jaxshape.data.sequences.hypotheses import Reading, reading_of
 
-_USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; beyond them a scale is doubted, not refused
+_USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; outside, a scale is doubted, not refused
 
 
 BADLY = 0.5
@@ -42,7 +42,7 @@ class Inspection(NamedTuple):
         colors: Frames with a colour image.
         masks: Frames with a mask.
         gaps: Missing frames.
-        rate: Depth images a second; None without times.
+        rate: Depth images per second; None without times.
         warnings: Suspicious observations, each with a remedy.
     """
 
@@ -59,16 +59,15 @@ class Inspection(NamedTuple):
 def inspect_sequence(
     sequence: Sequence, stated: tuple[str, ...] | None = None, *, keep_scale: bool = False
 ) -> Inspection:
-    """Look at a recording: names and poses of all frames, and images of some.
+    """Inspect a recording: names and poses of all frames, and images of some.
 
-    If poses and depth images fit far better in another convention, it is used, and a warning says
-    so.
+    If poses and depth images agree far better in another convention, it is used, with a warning.
 
     Args:
-        sequence: The recording, read as it is written.
+        sequence: The recording, read as written.
         stated: Names of the conventions in which it is known to be written, or `as-given`; None to
-            find out.
-        keep_scale: Whether its depth scale is known, so that no other is used.
+            detect them.
+        keep_scale: Whether the depth scale is known, so that no other one is used.
 
     Raises:
         SequenceError: None of the sampled depth images can be read.
@@ -109,7 +108,7 @@ def inspect_sequence(
 
 
 def _used(reading: Reading, keep_scale: bool) -> Convention | None:
-    """The convention that is used without being asked for; None for that which is written."""
+    """The convention that is used automatically; None to read the recording as written."""
     if reading.best is None or not reading.is_sure:
         return None
     convention = reading.best.convention
@@ -149,7 +148,7 @@ def _of_images(depths: Depths, pictures: tuple[str, ...]) -> Iterator[Finding]:
 
 
 def _of_scale(median: float, own: float, reading: Reading | None) -> Iterator[Finding]:
-    """Doubts of the depth scale by the median depth, in metres, where poses do not tell it."""
+    """Doubts about the depth scale from the median depth, in metres, unless poses determine it."""
     low, high = _USUAL_DEPTHS
     if not median or (reading and reading.best and reading.best.convention.depth_scale):
         return
@@ -189,7 +188,7 @@ def _of_camera(sequence: Sequence) -> Iterator[Finding]:
 
 
 def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:
-    """Whether the poses fit the depth images, and in which convention they would."""
+    """Warnings if the poses do not fit the depth images, with a convention in which they would."""
     if reading is None:
         return
     pairs, tolerance = reading.pairs, reading.tolerance

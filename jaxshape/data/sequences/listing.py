@@ -1,4 +1,4 @@
-"""The content of a folder, and the images that belong together, by number or by time."""
+"""List the content of a folder, and match images that belong together, by number or by time."""
 
 import os
 import re
@@ -41,13 +41,14 @@ class Listed(NamedTuple):
 
     Attributes:
         files: Files of each frame.
-        depth_scale: Depth units in a metre.
-        read_pose: Index of a frame to its pose; None where the recording has no poses.
-        times: Times of the depth images, in seconds; None where they are not known.
-        color_delays: Seconds from a depth image to its colour image; None where they are not known.
+        depth_scale: Depth units per metre.
+        read_pose: Function from the index of a frame to its pose; None if the recording has no
+            poses.
+        times: Times of the depth images, in seconds; None if they are not known.
+        color_delays: Seconds from a depth image to its colour image; None if they are not known.
         camera: The usual camera of such recordings, for folders without a camera.
-        calibration: Cameras that the recording's own files give; None where its folder is searched
-            for one.
+        calibration: Cameras from the recording's own files; None to search the folder for a camera
+            file.
         findings: Remarks that a user should know.
     """
 
@@ -76,19 +77,19 @@ def list_folder(folder: Path) -> Contents:
 def _is(asked: Callable[[], bool]) -> bool:
     try:
         return asked()
-    except OSError:  # links in a circle
+    except OSError:  # circular links
         return False
 
 
 def files_in(
     contents: Contents, names: Iterable[str], suffixes: tuple[str, ...]
 ) -> dict[str, Path]:
-    """The files, by name without suffix, in the order of their numbers, of the first sub-folder of
-    `names` that there is; none without one."""
+    """The files of the first existing sub-folder of `names`, by name without suffix, sorted by the
+    numbers in the names; empty if no sub-folder exists."""
     for name in names:
         if name in contents.folders:
             folder = contents.folder / name
-            inside = list_folder(folder)  # reading reports the faults of the others
+            inside = list_folder(folder)  # reading them reports faults of other entries
             found = (os.path.splitext(file) for file in inside.files | inside.others)
             chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
             return {stem: folder / (stem + end) for stem, end in sorted(chosen, key=_natural)}
@@ -128,8 +129,7 @@ def numbers_in(name: str) -> tuple[int, ...]:
 
 
 def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | None]:
-    """For each name the file of the same name, otherwise the one with the same numbers in its
-    name."""
+    """For each name, the file of the same name, otherwise the only one with the same numbers."""
     by_number: dict[tuple[int, ...], Path | None] = {}
     for name, path in offered.items():
         by_number[numbers_in(name)] = None if numbers_in(name) in by_number else path
@@ -138,7 +138,7 @@ def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | 
 
 
 def last_number(name: str) -> int:
-    """The last number in a name; -1 where it has none."""
+    """The last number in a name; -1 if it has none."""
     return (-1, *numbers_in(name))[-1]
 
 
@@ -148,13 +148,13 @@ def frame_files(
     color: Iterable[Path | None] | None = None,
     confidence: Iterable[Path | None] | None = None,
 ) -> tuple[FrameFiles, ...]:
-    """Files of the frame of each depth image.
+    """Files of one frame for each depth image.
 
     Args:
         contents: The folder.
         depth: Depth images by name.
         color: Colour image of each; None for images with the same names or numbers.
-        confidence: Confidence map of each; None for none.
+        confidence: Confidence map of each; None if there are none.
     """
     color = partners(depth, color_images(contents)) if color is None else color
     confidence = [None] * len(depth) if confidence is None else confidence
@@ -165,7 +165,7 @@ def frame_files(
 def nearest_in_time(
     wanted: Float[np.ndarray, " n"], offered: Float[np.ndarray, " m"]
 ) -> Int[np.ndarray, " n"]:
-    """Index of the reading nearest to each wanted time; -1 where even that is too far away.
+    """Index of the reading nearest to each wanted time; -1 if it is too far away.
 
     The limit is half the usual time between readings, or `NEAR` if that is more. `offered`
     increases.
@@ -183,7 +183,7 @@ def nearest_in_time(
 def with_colors_by_time(
     times: Float[np.ndarray, " n"], offered: Float[np.ndarray, " m"], paths: list[Path]
 ) -> tuple[list[Path | None], Float[np.ndarray, " n"]]:
-    """The colour image nearest to each time, and how much later it is, NaN where there is none."""
+    """The colour image nearest to each time, and its delay, NaN if there is none."""
     index = nearest_in_time(times, offered)
     found = index >= 0
     delays = np.full(len(times), np.nan)
@@ -192,6 +192,6 @@ def with_colors_by_time(
 
 
 def _natural(item: tuple[str, str]) -> list[str | int]:
-    """Order by the numbers in a name, and where there are none, by its letters."""
+    """Sorting key of a name: its numbers are compared as numbers, other text as text."""
     words = re.split(r"(\d+)", "".join(item))
     return [int(word) if i % 2 else word for i, word in enumerate(words)]

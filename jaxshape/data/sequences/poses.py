@@ -13,14 +13,14 @@ from jaxshape.data.sequences.frames import SequenceError
 from jaxshape.data.sequences.text import number, words_of
 
 READABLE_GAP = 0.1
-"""Seconds between two poses within which the camera's way is taken as straight."""
+"""Largest time between two poses, in seconds, for linear interpolation of the camera's path."""
 
 NEAR = 0.02
-"""Seconds within which two readings are of the same moment, as in TUM's own tools."""
+"""Largest difference, in seconds, of two readings of the same moment, as in TUM's own tools."""
 
 
 class StoredByColumns(SequenceError):
-    """A pose is a rigid motion once it is transposed, which cannot be by chance.
+    """A pose becomes a rigid motion when it is transposed, which cannot happen by chance.
 
     Attributes:
         T: The pose, transposed `[4 4]`.
@@ -32,9 +32,9 @@ class StoredByColumns(SequenceError):
 
 
 def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
-    """Read a square matrix of `size` rows of numbers; `SequenceError` if it is not.
+    """Read a square matrix of `size` rows; `SequenceError` if the file has another form.
 
-    Comments and commas are passed over.
+    Comments and commas are ignored.
     """
     try:
         rows = [[number(word) for word in words] for _, words in words_of(reading.read_text(path))]
@@ -50,7 +50,7 @@ def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
 
 
 def read_pose(path: Path | None) -> Float[np.ndarray, "4 4"] | None:
-    """Read a 4x4 rigid motion; None without a file, or where it holds NaN or infinity.
+    """Read a 4x4 rigid motion; None without a file, or if it contains NaN or infinity.
 
     7-Scenes writes NaN where its tracking was lost.
     """
@@ -60,7 +60,7 @@ def read_pose(path: Path | None) -> Float[np.ndarray, "4 4"] | None:
 
 
 def known(T: Float[np.ndarray, "4 4"], source: object) -> Float[np.ndarray, "4 4"] | None:
-    """A pose, checked; None where it is not finite, as recorders write them when they are lost."""
+    """A checked pose; None if it is not finite, which recorders write when tracking is lost."""
     if not np.isfinite(T).all():
         return None
     check_rigid(T, source)
@@ -118,9 +118,9 @@ def poses_at(
 ) -> Callable[[int], Float[np.ndarray, "4 4"] | None]:
     """Poses of a trajectory at other times: a function of the index into `wanted`.
 
-    `times` rise. Between two poses at most `READABLE_GAP` apart, the position is interpolated
-    linearly and the rotation along its geodesic. Otherwise the nearest pose is taken if it is
-    within `NEAR`, or none.
+    `times` increase. Between two poses at most `READABLE_GAP` apart, the position is interpolated
+    linearly and the rotation along its geodesic. Otherwise the nearest pose is used if it is within
+    `NEAR`; if not, there is none.
     """
     later = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
 
@@ -146,14 +146,14 @@ def _between(
 
 
 def from_opengl(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
-    """Poses of cameras with y up and z backwards, as OpenGL, Blender and ARKit have, as ours."""
+    """Convert poses of cameras with y up and z backwards (OpenGL, Blender, ARKit) into ours."""
     return T * np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def from_quaternions(
     places: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"], source: object
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Poses from places and quaternions x y z w; NaN where they are not finite."""
+    """Poses from positions and quaternions x y z w; NaN where they are not finite."""
     T = np.full((len(places), 4, 4), np.nan)
     finite = np.isfinite(places).all(axis=1) & np.isfinite(quaternions).all(axis=1)
     with np.errstate(over="ignore"):

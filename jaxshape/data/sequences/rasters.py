@@ -1,4 +1,4 @@
-"""Image files of a few formats, and arrays that are images: bounded before they are decoded."""
+"""Image files of a few formats, and arrays that are images; sizes are checked before decoding."""
 
 import warnings
 from collections.abc import Iterator
@@ -13,8 +13,8 @@ from jaxshape import limits, reading
 from jaxshape.data.sequences.errors import SequenceError
 
 FORMATS = ("PNG", "JPEG", "TIFF", "PPM")
-"""Formats that Pillow may decode (PPM includes PGM); formats that start other programs are left
-out."""
+"""Formats that Pillow may decode (PPM includes PGM); formats that start other programs are
+excluded."""
 
 
 class Stored(NamedTuple):
@@ -33,7 +33,7 @@ class Stored(NamedTuple):
 
 
 Picture = Path | Stored
-"""Where an image is: a file of its own, or an array."""
+"""Source of an image: a file, or an array."""
 
 
 @contextmanager
@@ -42,11 +42,11 @@ def open_picture(picture: Picture, most: int) -> Iterator[Image.Image]:
 
     Args:
         picture: The image.
-        most: Pixels that it may have.
+        most: Largest number of pixels.
 
     Raises:
         OSError: It cannot be opened.
-        ValueError: It is damaged, not a regular file, or larger.
+        ValueError: It is damaged, not a regular file, or larger than `most`.
         SequenceError: It is an EXR image, and the package that reads EXR is not installed.
     """
     if isinstance(picture, Stored):
@@ -56,7 +56,7 @@ def open_picture(picture: Picture, most: int) -> Iterator[Image.Image]:
     with reading.opened(picture, limits.IMAGE_BYTES) as file:
         if suffix == ".exr":
             yield _from_array(_read_exr(picture, most), most)
-        elif suffix == ".npy":  # mapped, so that a header that promises more takes no memory
+        elif suffix == ".npy":  # memory-mapped, so that a false header takes no memory
             yield _from_array(np.load(picture, mmap_mode="r", allow_pickle=False), most)
         else:
             with warnings.catch_warnings():
@@ -73,7 +73,7 @@ def _check_size(width: int, height: int, most: int) -> None:
 
 
 def _from_array(array: Any, most: int) -> Image.Image:
-    """An image of a depth map, a mask or colours; other numbers than bytes and 16 bit as floats."""
+    """An image from an array; numbers other than 8 and 16 bit unsigned become floats."""
     array = np.asarray(array)
     if array.ndim == 3 and array.shape[0] == 1:
         array = array[0]

@@ -1,4 +1,4 @@
-"""Numbers in text files as people write them, with comments, commas and brackets."""
+"""Numbers in hand-written text files, with comments, commas and brackets."""
 
 import re
 
@@ -8,14 +8,14 @@ _COMMENT = re.compile(r"(?:^|\s)(?:#|//|%).*")  # not inside a word: Windows wri
 
 
 def words_of(text: str) -> list[tuple[int, list[str]]]:
-    """The number of each line, from 1, and its words; lines without any are left out.
+    """The number of each line, from 1, and its words; lines without words are left out.
 
-    Comments behind `#`, `//` or `%` are dropped; commas, semicolons and brackets count as spaces.
+    Comments after `#`, `//` or `%` are dropped; commas, semicolons and brackets count as spaces.
     """
     plain = (re.sub(r"[,;\[\](){}]", " ", _COMMENT.sub("", line)) for line in text.splitlines())
     return [(i, words) for i, line in enumerate(plain, 1) if (words := line.split())]
 
 
 def number(word: str) -> float:
-    """A number from a text file, Windows' spellings of NaN and infinity, `-1.#IND`, among them."""
+    """Parse a number from a text file, also Windows' spellings of NaN and infinity, `-1.#IND`."""
     return np.nan if "#" in word else float(word)

@@ -20,8 +20,8 @@ class Trajectory(NamedTuple):
 
     Attributes:
         T_world_camera: Camera to world `[n 4 4]`, rigid, in metres.
-        frames: Number of the frame, from 0, that each pose belongs to `[n]`.
-        times: Time of each pose `[n]`, in seconds; None where only the frames are known.
+        frames: Index of the frame, from 0, to which each pose belongs `[n]`.
+        times: Time of each pose `[n]`, in seconds; None if only the frames are known.
     """
 
     T_world_camera: Float[np.ndarray, "n 4 4"]
@@ -30,7 +30,7 @@ class Trajectory(NamedTuple):
 
 
 class Pinhole(NamedTuple):
-    """The camera of a trajectory, as `.json` holds it.
+    """The camera of a trajectory in a `.json` file.
 
     Attributes:
         intrinsics: Camera matrix `[3 3]`, in pixels, where column j covers u in [j, j + 1).
@@ -42,14 +42,14 @@ class Pinhole(NamedTuple):
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
-    """Read a trajectory; the suffix of the file tells its format. [host]
+    """Read a trajectory in the format of the file's suffix. [host]
 
     - `.log` (Redwood, Open3D): a line `frame frame frames`, then the 4x4 camera to world.
     - `.json` (Open3D's PinholeCameraTrajectory): 4x4 world to camera, by columns.
     - Other files are in TUM's format: `time tx ty tz qx qy qz qw`, camera to world, a pose on each
       line. Its poses are numbered in their order.
 
-    Poses that hold NaN, as some write them where tracking was lost, are left out.
+    Poses with NaN, which some programs write where tracking was lost, are left out.
 
     Args:
         path: The file to read.
@@ -71,7 +71,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def read_unchecked(path: Path) -> Trajectory:
-    """Read a trajectory as `read_trajectory` does, with poses that are lost or not rigid."""
+    """Read a trajectory like `read_trajectory`, but keep poses that are lost or not rigid."""
     read = {".log": _read_log, ".json": _read_json}.get(path.suffix.lower(), _read_tum)
     try:
         return read(reading.read_text(path))
@@ -85,16 +85,15 @@ def read_unchecked(path: Path) -> Trajectory:
 def write_trajectory(
     path: str | Path, trajectory: Trajectory, camera: Pinhole | None = None
 ) -> None:
-    """Write a trajectory in the format of the suffix, as `read_trajectory` reads it. [host]
+    """Write a trajectory in the format of the suffix; `read_trajectory` reads it. [host]
 
     Args:
         path: The file to write: `.log` or `.json` (Open3D), any other for TUM's format.
-        trajectory: The poses; without times, the numbers of the frames take their place in TUM's
-            format.
+        trajectory: The poses; without times, TUM's format gets the indices of the frames instead.
         camera: The camera, which `.json` needs; None for the other formats.
 
     Raises:
-        ValueError: A `.json` file is asked for without a camera.
+        ValueError: A `.json` file is requested without a camera.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -159,7 +158,7 @@ def _read_log(text: str) -> Trajectory:
         [[[number(w) for w in row] for row in words[i + 1 : i + 5]] for i in _fifth(words)]
     )
     frames = np.array([int(words[i][0]) for i in _fifth(words)], dtype=int)
-    if (np.diff(frames) <= 0).any():  # other numbers, such as those of fragments
+    if (np.diff(frames) <= 0).any():  # not indices of frames, but e.g. of fragments
         frames = np.arange(len(frames))
     return Trajectory(T.reshape(-1, 4, 4), frames)
 
@@ -188,7 +187,7 @@ def _read_json(text: str) -> Trajectory:
 
 def _json_text(trajectory: Trajectory, camera: Pinhole) -> str:
     K = camera.intrinsics.copy()
-    K[:2, 2] -= 0.5  # Open3D counts from the centre of the first pixel
+    K[:2, 2] -= 0.5  # Open3D's coordinates start at the centre of the first pixel
     intrinsic = {
         "height": camera.shape[0],
         "intrinsic_matrix": K.T.ravel().tolist(),

@@ -1,4 +1,4 @@
-"""Entries of a recording that are not read: no files, or files that look like poses or a camera."""
+"""Unread entries of a recording: not regular files, or files that look like poses or a camera."""
 
 import re
 from collections.abc import Iterator
@@ -25,9 +25,9 @@ def unread(
 
     Args:
         contents: The folder.
-        has_poses: Whether the recording was found to have poses; if so, no others are missed.
+        has_poses: Whether poses were found; if so, files that look like poses are not reported.
         has_camera: Whether a camera was found.
-        earlier: Remarks made before; files that they name are left out.
+        earlier: Earlier remarks; files that they name are left out.
     """
     if contents.others:
         yield Finding(

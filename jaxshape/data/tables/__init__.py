@@ -4,8 +4,8 @@ A table is drawn in the order of its modules: `tops`, `bases` (legs and pedestal
 `storage` (drawers, shelves, attachments of desks), `family` (styles, frequencies, sizes).
 
 The canonical frame is the same as for chairs: +y up, box centred at the origin. The long side of a
-top lies along x. A table that has a front, as a desk with its drawers and the place of its sitter,
-turns it to +z; most others look the same from both long sides, square and round ones from all four.
+top is along x. A table with a front, such as a desk with drawers and a place to sit, faces +z; most
+others look the same from both long sides, and square and round ones from all four.
 """
 
 from jaxshape.data.tables.family import FREQUENCIES as FREQUENCIES

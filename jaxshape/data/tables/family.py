@@ -1,4 +1,4 @@
-"""The styles of the family: which tops, bases and storage meet, how often, how big."""
+"""The styles of the family: combinations of tops, bases and storage, frequencies, sizes."""
 
 import numpy as np
 import trimesh
@@ -26,7 +26,7 @@ def _plain(
     shelf: float = 0.0,
     drawers: float = 0.0,
 ) -> list[Part]:
-    """A top on a base, by chance with a shelf and with drawers in front."""
+    """A top on a base, sometimes with a shelf or with drawers in front."""
     under = inside(top, draw.between(0.8, 1.0) if draw.chance(0.35) else draw.between(0.95, 1.0))
     parts = top_parts(draw, top, tops) + base_parts(draw, under, bases)
     if draw.chance(shelf):
@@ -88,7 +88,7 @@ def _plain_desk(draw: Draw) -> list[Part]:
 
 
 def _desk(draw: Draw) -> list[Part]:
-    """A desk on a cabinet at one end or both; the sitter's place is in front."""
+    """A desk on a cabinet at one end or both; the place to sit is in front."""
     top = draw_top(draw, width=(1.0, 2.0), depth=(0.5, 0.9), height=(0.7, 0.78),
                    outlines={"rectangle": 1.0})  # fmt: skip
     top = top._replace(thickness=max(top.thickness, 0.014))
@@ -338,7 +338,7 @@ def _drafting(draw: Draw) -> list[Part]:
 
 
 def _nest(draw: Draw) -> list[Part]:
-    """Two or three small tables, each partly under the one before."""
+    """Two or three small tables, each partly under the previous one."""
     top = draw_top(
         draw, width=(0.45, 0.7), depth=(0.35, 0.5), height=(0.45, 0.6), outlines=STRAIGHT
     )

@@ -35,8 +35,7 @@ def drawers_under(draw: Draw, top: Board) -> list[Part]:
 
 
 def _fronts(draw: Draw, x: Range, y: Range, z: Number, grid: tuple[int, int]) -> list[Part]:
-    """Drawer fronts with handles on the face of a case at z; `grid` is their number across and
-    upward."""
+    """Drawer fronts with handles on a case's face at z; `grid` is their number across and up."""
     across, upward = grid
     out, gap = draw.between(0.006, 0.02), draw.between(0.006, 0.02)
     wide, high = (x[1] - x[0]) / across, (y[1] - y[0]) / upward

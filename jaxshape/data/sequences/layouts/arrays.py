@@ -32,8 +32,8 @@ def _files(contents: Contents) -> list[Path]:
 def list_frames(contents: Contents) -> Listed:
     """`depth [n h w]`, `color [n h w 3]`, `K [3 3]` or `[n 3 3]`, `poses [n 4 4]`, `masks [n h w]`.
 
-    Depth is in metres if it is of floats, in millimetres if of integers. Poses are camera to world;
-    K is as OpenCV has it, with the centre of the first pixel at 0, 0.
+    Depth is in metres if its type is float, in millimetres if it is integer. Poses are camera to
+    world; K follows OpenCV, with the centre of the first pixel at 0, 0.
     """
     path = next(iter(sorted(_files(contents))), None)
     if path is None:
@@ -87,7 +87,7 @@ def _calibration(K: np.ndarray, path: Path) -> Calibration:
 def _of_frames(
     array: np.ndarray | None, depth: tuple[int, ...], last: tuple[int, ...], path: Path, name: str
 ) -> np.ndarray | None:
-    """Images of the frames, with as many dimensions as they should have."""
+    """Images of all frames, checked, with a leading axis over frames."""
     if array is None:
         return None
     array = array[None] if array.ndim == 2 + len(last) else array
@@ -118,7 +118,7 @@ def _checked(
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays that are used, by the first of their names."""
+    """The arrays that are used, by kind; the first of their possible names counts."""
     try:
         there = reading.array_names(path)
         chosen = {

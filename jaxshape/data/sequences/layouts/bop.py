@@ -22,7 +22,7 @@ from jaxshape.data.sequences.listing import (
 from jaxshape.data.sequences.poses import known
 
 Instance = tuple[int, int]
-"""Number of an object, and which of the objects with this number in an image it is."""
+"""Number of an object, and its index among the objects with this number in an image."""
 
 
 def fits(contents: Contents) -> bool:
@@ -63,7 +63,7 @@ def _key(name: str) -> str:
 
 def _cameras(images: list[Any], source: Path) -> Float[np.ndarray, "n 3 3"]:
     K = np.stack([matrix_of(_entry(one, "cam_K"), (3, 3), source, "cam_K") for one in images])
-    K[:, :2, 2] += 0.5  # theirs count from the centre of the first pixel
+    K[:, :2, 2] += 0.5  # their coordinates start at the centre of the first pixel
     return K
 
 
@@ -72,7 +72,7 @@ def _entry(image: Any, name: str) -> Any:
 
 
 def _depth_scale(images: list[Any], source: Path) -> float:
-    """Depth units in a metre, from the millimetres in a unit, which all images have to share."""
+    """Depth units per metre, from the millimetres per unit, which all images must share."""
     units = {
         float(matrix_of(_entry(one, "depth_scale") or 1.0, (), source, "depth_scale"))
         for one in images
@@ -95,7 +95,7 @@ def _ground_truth(contents: Contents) -> dict[str, Any]:
 
 
 def _instances(objects: Any) -> list[Instance]:
-    """The objects of one image, in the order in which it lists them."""
+    """The objects of one image, in the order of its list."""
     seen: Counter[int] = Counter()
     found = []
     for one in objects if isinstance(objects, list) else []:
@@ -107,7 +107,7 @@ def _instances(objects: Any) -> list[Instance]:
 
 
 def _instance(truth: dict[str, Any]) -> tuple[Instance | None, tuple[Finding, ...]]:
-    """The object that most images show, the first of several."""
+    """The object that most images show; the first one of several."""
     shown = Counter(instance for objects in truth.values() for instance in _instances(objects))
     if not shown:
         return None, ()
@@ -152,7 +152,7 @@ def _poses(images: list[Any], truth: list[Any], instance: Instance | None, sourc
 
 
 def _inverse(entry: Any, frames: str, source: Path) -> Float[np.ndarray, "4 4"] | None:
-    """Camera to world, or to model, from the rotation and the millimetres of its inverse."""
+    """Camera to world, or to model, from the rotation and translation (in mm) of the inverse."""
     T = np.eye(4)
     T[:3, :3] = matrix_of(_entry(entry, f"cam_R_{frames}"), (3, 3), source, f"cam_R_{frames}")
     T[:3, 3] = matrix_of(_entry(entry, f"cam_t_{frames}"), (3,), source, f"cam_t_{frames}") / 1000

@@ -33,7 +33,7 @@ from jaxshape.data.sequences.trajectories import read_unchecked
 MILLIMETRES = 1000.0
 
 _POSE_FOLDERS = {"poses": False, "pose": False, "ob_in_cam": True, "annotated_poses": True}
-"""Folders of 4x4 matrices, and whether they map the object to the camera, as BundleSDF's own."""
+"""Folders of 4x4 matrices, and whether they map object to camera, like BundleSDF's own."""
 
 _STAMPED = re.compile(r"\d+-\d+")
 
@@ -52,7 +52,7 @@ def list_redwood(contents: Contents) -> Listed:
     """Object scans (Choi et al., 2016): `depth/N-TIME.png`, `rgb/N-TIME.jpg`, microseconds.
 
     The streams are not synchronised: each depth image gets the colour image nearest in time. There
-    are no poses, unless a trajectory lies next to the folders.
+    are no poses, unless there is a trajectory file beside the folders.
     """
     depth, offered = depth_images(contents), color_images(contents)
     offered = {name: path for name, path in offered.items() if _STAMPED.fullmatch(name)}
@@ -84,8 +84,8 @@ def fits_bundlesdf(contents: Contents) -> bool:
 def list_bundlesdf(contents: Contents) -> Listed:
     """BundleSDF (Wen et al., CVPR 2023): `rgb/ depth/ masks/ cam_K.txt`, perhaps `poses/`.
 
-    `poses/N.txt` are camera to world; those of `ob_in_cam/` and `annotated_poses/`, the names that
-    BundleSDF uses itself, are object to camera, so the object's frame is then the world.
+    `poses/N.txt` are camera to world; those of `ob_in_cam/` and `annotated_poses/`, BundleSDF's own
+    names, are object to camera, so that the world is then the object's frame.
     """
     return _by_name(contents)._replace(camera=None)
 
@@ -135,7 +135,7 @@ def _lone_colors(offered: int, found: list[Path | None]) -> tuple[Finding, ...]:
 
 
 def _pose_files(contents: Contents, names: list[str]) -> PoseReader | None:
-    """Poses in files of their own, with the names or the numbers of the depth images."""
+    """Poses in one file each, with the names or the numbers of the depth images."""
     for folder, is_object_to_camera in _POSE_FOLDERS.items():
         if offered := files_in(contents, (folder,), (".txt",)):
             return _reader(partners(names, offered), is_object_to_camera)
@@ -200,7 +200,7 @@ def _is_log(path: Path) -> bool:
 
 
 def _is_json_trajectory(path: Path) -> bool:
-    if "traj" in path.name.lower():  # if it is no trajectory, its reader says why
+    if "traj" in path.name.lower():  # if it is not a trajectory, its reader reports why
         return True
     try:
         return "parameters" in reading.read_json_object(path)

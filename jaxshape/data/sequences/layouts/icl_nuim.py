@@ -1,4 +1,4 @@
-"""ICL-NUIM (Handa et al., ICRA 2014): rendered rooms, in the form that is compatible with TUM's."""
+"""ICL-NUIM (Handa et al., ICRA 2014): rendered rooms, in its TUM-compatible form."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -37,8 +37,8 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`transforms.json`, and the images it names: `file_path`, `depth_file_path`, `mask_path`.
 
-    Poses are camera to world with OpenGL's axes, y up and z backwards; cameras count pixels from
-    the corner of the image, as ours do. Frames are ordered by the names of their images.
+    Poses are camera to world with OpenGL's axes, y up and z backwards; pixel coordinates start at
+    the corner of the image, like ours. Frames are sorted by the names of their images.
     """
     source = contents.folder / _SOURCE
     about = read_json_object(source)
@@ -106,7 +106,7 @@ def _files(folder: Path, frame: dict[str, Any], depth: Path | None, source: Path
     assert depth is not None
     name, mask = frame.get("file_path"), frame.get("mask_path")
     color = below(folder, name, source) if name else None
-    if color is not None and not color.suffix:  # as Blender's synthetic scenes name them
+    if color is not None and not color.suffix:  # names in Blender's synthetic scenes
         color = color.with_suffix(".png")
     if color is not None and not color.is_file():
         color = None
@@ -131,7 +131,7 @@ def _depth_scale(about: dict[str, Any], files: list[FrameFiles], source: Path) -
 def _calibration(
     about: dict[str, Any], frames: list[dict[str, Any]], files: list[FrameFiles], source: Path
 ) -> Calibration:
-    """The camera of each frame; its entries take precedence over those of the whole file."""
+    """The camera of each frame; entries of a frame take precedence over those of the file."""
     entries = [{name: one.get(name, about.get(name)) for name in _CAMERA} for one in frames]
     shape = _shape(entries, files, source)
     numbers = np.array([_numbers(entry, shape, source) for entry in entries])
@@ -152,7 +152,7 @@ def _shape(entries: list[dict[str, Any]], files: list[FrameFiles], source: Path)
 
 
 def _numbers(entry: dict[str, Any], shape: tuple[int, int], source: Path) -> list[float]:
-    """fx, fy, cx, cy; without focal lengths from the angles of view, as Blender gives them."""
+    """fx, fy, cx, cy; without focal lengths, from the angle of view, which Blender gives."""
     h, w = shape
     fx, fy = entry.get("fl_x"), entry.get("fl_y")
     if fx is None and entry.get("camera_angle_x") is not None:

@@ -1,4 +1,4 @@
-"""RealSense recordings, as `rs-convert -r -p` unpacks a `.bag`: raw depth, images of colour."""
+"""RealSense recordings: a `.bag` unpacked by `rs-convert -r -p` to raw depth and colour images."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ _SIZES = (
     (1280, 720), (1024, 768), (848, 480), (640, 480), (640, 360), (480, 270), (424, 240),
     (320, 240), (256, 144),
 )  # fmt: skip
-"""Width and height of the depth images of these cameras, each with another number of pixels."""
+"""Width and height of the depth images of these cameras; all have different numbers of pixels."""
 
 _RAW, _PAINTED, _COLOR = (
     re.compile(rf"(?:.*_)?{stem}_(\d+(?:\.\d*)?)\.{end}$", re.IGNORECASE)
@@ -32,8 +32,9 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`NAME_Depth_MILLISECONDS.raw` of 16 bits in millimetres, `NAME_Color_MILLISECONDS.png`.
 
-    A raw file does not tell its width. It is that of the colour image, if depth was aligned to it,
-    or else of the one size of these cameras with as many pixels.
+    A raw file does not contain its width. The width is that of the colour image, if depth was
+    aligned to it; otherwise it is that of the only size of these cameras with the same number of
+    pixels.
     """
     depth, color = _timed(contents, _RAW), _timed(contents, _COLOR)
     if not depth:
@@ -62,7 +63,7 @@ def list_frames(contents: Contents) -> Listed:
 
 
 def _timed(contents: Contents, pattern: re.Pattern[str]) -> _Timed:
-    """The files whose names match, with the milliseconds in their names, by time."""
+    """The files whose names match, with the milliseconds in their names, sorted by time."""
     found = ((pattern.match(name), name) for name in contents.files)
     return sorted((float(match[1]), contents.folder / name) for match, name in found if match)
 
@@ -76,7 +77,7 @@ def _shape(path: Path, color: _Timed) -> tuple[int, int]:
             with open_picture(color[0][1], limits.COLOR_PIXELS) as image:
                 sizes.insert(0, (image.width, image.height))
         except (OSError, ValueError, Image.DecompressionBombError):
-            pass  # reading the frame says what is wrong with it
+            pass  # reading the frame reports its fault
     for width, height in sizes:
         if width * height == pixels:
             return height, width
@@ -87,7 +88,7 @@ def _shape(path: Path, color: _Timed) -> tuple[int, int]:
 
 
 def _depth_image(path: Path, shape: tuple[int, int]) -> Path | Stored:
-    """The image in a file; the file itself where its length is another, so that reading fails."""
+    """The image in a file; for a file of another length, the file itself, so that reading fails."""
     try:
         return Stored(str(path), np.memmap(path, "<u2", "r", shape=shape))
     except (OSError, ValueError):

@@ -50,8 +50,8 @@ def _metadata(contents: Contents) -> list[Path]:
 def list_frames(contents: Contents) -> Listed:
     """`depth/N.exr` in metres, `rgb/N.jpg`, and `metadata.json` with poses and cameras by frame.
 
-    Poses are quaternion and place, camera to world, with ARKit's axes: y up, z backwards. Cameras
-    belong to the colour images, whose size is in the metadata.
+    Poses are quaternion and position, camera to world, with ARKit's axes: y up, z backwards.
+    Cameras belong to the colour images, whose size is in the metadata.
     """
     if _packed(contents) and not has_depth_folder(contents):
         raise SequenceError(f"{contents.folder} {_PACKED}")

@@ -47,15 +47,15 @@ def _poses(contents: Contents) -> Path | None:
 
 
 def _is_matrices(path: Path) -> bool:
-    """Whether a file has 16 numbers on its first line, unlike a trajectory of TUM's."""
+    """Whether a file has 16 numbers on its first line, unlike a trajectory of TUM."""
     return len(read_document(path).lstrip().split("\n", 1)[0].split()) == 16
 
 
 def list_frames(contents: Contents) -> Listed:
     """`results/depthN.png` and `results/frameN.jpg`, or `depth/` and `rgb/`, and `traj.txt`.
 
-    Line i of `traj.txt` is the camera to world, by rows, of the i-th image. The camera and the
-    depth scale come from `cam_params.json`, here or in the parent folder.
+    Line i of `traj.txt` is the camera-to-world matrix of the i-th image, by rows. The camera and
+    the depth scale come from `cam_params.json`, here or in the parent folder.
     """
     if "results" in contents.folders:
         every = files_in(contents, ("results",), COLOR_SUFFIXES + DEPTH_SUFFIXES)

@@ -22,14 +22,14 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`depth/N.png` in millimetres, `color/N.jpg`, `pose/N.txt`, `intrinsic/intrinsic_depth.txt`.
 
-    Poses are camera to world, of -inf where tracking was lost. The colour camera has more pixels
-    and lies a few millimetres from the depth camera; the colours are taken as registered to the
+    Poses are camera to world, with -inf where tracking was lost. The colour camera has more pixels
+    and is a few millimetres from the depth camera; its images are treated as registered to the
     depth images.
     """
     depth = depth_images(contents)
     poses = partners(depth, files_in(contents, ("pose", "poses"), (".txt",)))
     K = read_matrix(contents.folder / _CAMERA, 4)[:3, :3]
-    K[:2, 2] += 0.5  # theirs count from the centre of the first pixel
+    K[:2, 2] += 0.5  # their coordinates start at the centre of the first pixel
     return Listed(
         files=frame_files(contents, depth),
         depth_scale=1000.0,

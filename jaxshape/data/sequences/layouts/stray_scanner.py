@@ -23,10 +23,10 @@ from jaxshape.data.sequences.listing import (
 from jaxshape.data.sequences.poses import from_quaternions, known
 
 _FILM = (1440, 1920)
-"""Height and width of the film, of which the camera is."""
+"""Height and width of the film, to which the camera matrix belongs."""
 
 MAX_COLUMNS = 100
-"""Columns of the table that are read."""
+"""Largest number of columns of the table that are read."""
 
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _OWN_CAMERA = ("fx", "fy", "cx", "cy")
@@ -39,8 +39,8 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`depth/N.png` in millimetres, `confidence/N.png`, `odometry.csv`, `camera_matrix.csv`.
 
-    Poses are camera to world, of OpenCV's axes. Newer versions give each frame its own camera. The
-    colours are in a film, `rgb.mp4`; they are used where they were unpacked to `rgb/N.png`.
+    Poses are camera to world, with OpenCV's axes. Newer versions give each frame its own camera.
+    The colours are in a film, `rgb.mp4`; they are used if it was unpacked to `rgb/N.png`.
     """
     depth = depth_images(contents)
     source = contents.folder / "odometry.csv"
@@ -70,7 +70,7 @@ def list_frames(contents: Contents) -> Listed:
 
 
 def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
-    """The columns of the table by their names; NaN where a cell is empty."""
+    """The columns of the table by their names; NaN for empty cells."""
     try:
         lines = list(csv.reader(read_document(path).splitlines()))
     except csv.Error as error:
@@ -103,7 +103,7 @@ def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
 def _calibration(
     contents: Contents, columns: dict[str, np.ndarray], rows: list[int], color: list[Path | None]
 ) -> Calibration | None:
-    """The camera of each frame, otherwise the common camera; both for images of the film's size."""
+    """The camera of each frame, or else the common camera; both for images of the film's size."""
     images = [path for path in color if path]
     shape = read_shape(images[0]) if images else _FILM
     own = [columns[name][rows] for name in _OWN_CAMERA if name in columns]

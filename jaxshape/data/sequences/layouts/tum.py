@@ -26,7 +26,7 @@ _CALIBRATED = {
     "2": (520.9, 521.0, 325.1, 249.7),
     "3": (535.4, 539.2, 320.1, 247.6),
 }
-"""fx, fy, cx, cy of the colour cameras, to which depth is registered, by the benchmark."""
+"""fx, fy, cx, cy of the benchmark's colour cameras, to which depth is registered."""
 
 
 def fits(contents: Contents) -> bool:
@@ -64,7 +64,7 @@ def list_frames(contents: Contents) -> Listed:
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
-    """Times, rising, and images of lines `time file`; a few lines may stand in another order."""
+    """Sorted times, and images, of lines `time file`; a few lines may be in another order."""
     try:
         words = [line.split(maxsplit=1) for line in reading.read_text(path).splitlines()]
         pairs = [(float(w[0]), w[1].strip()) for w in words if w and not w[0].startswith("#")]
@@ -83,7 +83,7 @@ def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
 
 
 def check_rising(times: Float[np.ndarray, " n"], path: Path) -> None:
-    """Raise `SequenceError` where a tenth of the times do not rise, as intervals do not."""
+    """Raise `SequenceError` if over a tenth of the times do not rise, as with intervals."""
     still = np.flatnonzero(np.diff(times) <= 0)
     if len(still) > 0.1 * len(times):
         first = times[still[0]], times[still[0] + 1]
@@ -97,7 +97,7 @@ def check_rising(times: Float[np.ndarray, " n"], path: Path) -> None:
 def _poses(
     path: Path, times: Float[np.ndarray, " n"]
 ) -> tuple[Callable[[int], Float[np.ndarray, "4 4"] | None] | None, tuple[Finding, ...]]:
-    """Poses at the times of the depth images; none where the two never overlap, which is said."""
+    """Poses at the times of the depth images; if the times never overlap, no poses but a remark."""
     if not path.is_file():
         return None, ()
     trajectory = read_trajectory(path)

@@ -25,7 +25,7 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`rgb/ depth/ masks/`, `cam_poses.txt` (number, 16 numbers), and the camera in `metadata`.
 
-    Depth is in millimetres; poses are camera to world, of OpenCV's axes.
+    Depth is in millimetres; poses are camera to world, with OpenCV's axes.
     """
     depth = depth_images(contents)
     source = contents.folder / _POSES
@@ -56,5 +56,5 @@ def _calibration(contents: Contents) -> Calibration | None:
     K = matrix_of(about.get("K"), (3, 3), source, "K")
     if not np.array_equal(K[2], (0, 0, 1)):  # it is stored by columns
         K = K.T.copy()
-    K[:2, 2] += 0.5  # theirs count from the centre of the first pixel
+    K[:2, 2] += 0.5  # their coordinates start at the centre of the first pixel
     return Calibration(K[None], shape_of(about.get("h"), about.get("w"), source), source.name)
