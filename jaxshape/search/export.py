@@ -18,9 +18,9 @@ from jaxshape.checks import whole
 from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.config import RefineConfig
+from jaxshape.search.keys import one_key_each
 from jaxshape.search.reconstruction import Reconstruction, reconstruct, require_batch
 from jaxshape.search.refiner import Distribution, Refiner, Trace
-from jaxshape.search.run import one_key_each
 
 PLATFORMS = ("cpu", "cuda")
 

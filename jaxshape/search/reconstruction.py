@@ -17,12 +17,14 @@ from jaxshape.model.shapes import ShapePrior, decode, encode
 from jaxshape.search.composition import complete, known_or
 from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.devices import over_devices
+from jaxshape.search.keys import one_key_each
+from jaxshape.search.loop import Callback
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty
 from jaxshape.search.posterior import sample_codes
 from jaxshape.search.refiner import Refiner, Trace
 from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual
-from jaxshape.search.run import Callback, one_key_each, refine
+from jaxshape.search.run import refine
 from jaxshape.search.space import LatentSpace, raw, whitened
 
 

@@ -1,24 +1,21 @@
 """The refinement loop: many objects, each with its population, in one compiled program."""
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.chunks import vary_like
 from jaxshape.model.shapes import Precision, ShapePrior, pick
-from jaxshape.search.devices import numbers, over_devices
+from jaxshape.search.devices import over_devices
+from jaxshape.search.keys import keys_of
+from jaxshape.search.loop import Callback, Loop, Rows, SearchState
 from jaxshape.search.objective import (
     Evaluation,
     ObjectTerms,
     Penalty,
-    composed,
     evaluation,
     prepare_one,
 )
@@ -26,7 +23,6 @@ from jaxshape.search.refiner import (
     Refiner,
     StopReason,
     Trace,
-    advance,
     finite_or_inf,
 )
 from jaxshape.search.residuals import BALANCED, Residual
@@ -59,11 +55,6 @@ class Refined(NamedTuple):
     iterations: Int[Array, " object"]
     stop: Int[Array, " object"]
     state: Any
-
-
-# The arguments of a callback after each iteration: numbers of the objects [n], the iterations that
-# each of them has taken [n], and its trace [n ...], as NumPy arrays.
-Callback = Callable[[np.ndarray, np.ndarray, Trace], None]
 
 
 def refine(
@@ -133,7 +124,7 @@ def refine(
             "Both previous and warm_start are given; give previous to go on with the same targets,"
             " warm_start for a new search near an earlier one."
         )
-    rows = _Rows(
+    rows = Rows(
         keys=keys_of(keys, codes, prior),
         codes=codes,
         targets=targets,
@@ -151,7 +142,7 @@ def refine(
             searched.own, rows.targets, jnp.full(len(rows.codes), weight, jnp.float32)
         )
         how = _evaluation(prior, searched, residual, penalty, rows.codes, own)
-        loop = _Loop(refiner, how, space, own, target_loss, callback)
+        loop = Loop(refiner, how, space, own, target_loss, callback)
         states, steps, traces, path = loop.run(rows, iterations)
         if precision != "float32":
             exact = prepare_one(prior, rows.grids, "float32")
@@ -172,122 +163,11 @@ def refine(
     return over_devices(search, (prior, space, penalty_weight, target_loss), rows, devices)
 
 
-class _Begun(NamedTuple):
-    """Progress of the search of each object.
-
-    Attributes:
-        state: State of its refiner.
-        trace: Trace of its last iteration.
-        iterations: Iterations that it has taken `[object]`.
-    """
-
-    state: Any
-    trace: Trace
-    iterations: Int[Array, " object"]
-
-
-def _begun(previous: Refined) -> _Begun:
+def _begun(previous: Refined) -> SearchState:
     """The states from which searches go on; those that reached their target may get a lower one."""
     state, trace = previous.state, jax.tree.map(lambda x: x[:, -1], previous.trace)
     stop = jnp.where(state.stop == StopReason.TARGET, StopReason.RUNNING, state.stop)
-    return _Begun(state._replace(stop=stop), trace, previous.iterations)
-
-
-class _Rows(NamedTuple):
-    """The arrays that belong to single objects, with a leading axis over objects.
-
-    Attributes:
-        keys: Random key of each object.
-        codes: First codes `[object d]`.
-        targets: Targets of the residual.
-        grids: F and M, or None.
-        first_losses: Objectives of the first codes, or None.
-        begun: States of an interrupted search, or None.
-        warm_start: States of a search for an earlier measurement, or None.
-    """
-
-    keys: Key[Array, " object"]
-    codes: Float[Array, "object d"]
-    targets: PyTree
-    grids: Grids | None
-    first_losses: Float[Array, " object"] | None
-    begun: _Begun | None
-    warm_start: Any
-
-
-class _Loop(NamedTuple):
-    """The loop over iterations, of a batch of objects.
-
-    Attributes:
-        refiner: The search.
-        how: The scoring of codes.
-        space: Coordinates of the search.
-        own: Part of each object's objective that belongs to it alone.
-        target_loss: Loss that is low enough to stop, or None.
-        callback: Function that is called after every iteration, or None.
-    """
-
-    refiner: Refiner
-    how: Evaluation
-    space: LatentSpace
-    own: ObjectTerms
-    target_loss: Float[Array, ""] | float | None
-    callback: Callback | None
-
-    def run(
-        self, rows: _Rows, iterations: int
-    ) -> tuple[Any, Int[Array, " object"], Trace, Float[Array, "object iteration d"]]:
-        """States, iterations of each object, traces, and the best point after each iteration."""
-        first = vary_like(self.first(rows), rows.codes)
-
-        def iterate(now: _Begun, _: Any) -> tuple[_Begun, tuple[Trace, Array]]:
-            running = now.state.stop == StopReason.RUNNING
-            now = lax.cond(jnp.any(running), partial(self.move, rows), lambda now: now, now)
-            return now, (now.trace, now.state.best.point)
-
-        last, shown = lax.scan(iterate, first, length=iterations)
-        over_iterations = partial(jnp.moveaxis, source=0, destination=1)
-        traces, path = jax.tree.map(over_iterations, shown)
-        return last.state, last.iterations, traces, path
-
-    def first(self, rows: _Rows) -> _Begun:
-        """The states at the start of the searches, or where they were interrupted."""
-        if rows.begun is not None:
-            begun = rows.begun
-        else:
-            keys = jax.vmap(jax.random.fold_in, (0, None))(rows.keys, 0)
-            started = jax.vmap(self.begin)(
-                keys, rows.codes, self.own, rows.first_losses, rows.warm_start
-            )
-            begun = _Begun(*started, jnp.zeros(len(rows.codes), jnp.int32))
-        return begun._replace(state=_stop_at(self.target_loss, begun.state))
-
-    def begin(
-        self, key: Array, code: Array, own: ObjectTerms, loss: Any, state: Any
-    ) -> tuple[Any, Trace]:
-        """The first state of one object."""
-        point = self.space.from_code(code) if state is None else state.best.point
-        if loss is None or state is not None:
-            loss = composed(self.how, self.space, own)(point)
-        if state is None or self.refiner.resume is None:
-            return self.refiner.init(key, point, loss)
-        return self.refiner.resume(key, state, loss)
-
-    def move(self, rows: _Rows, now: _Begun) -> _Begun:
-        """One iteration of all objects; stopped objects do not change."""
-        running = now.state.stop == StopReason.RUNNING
-
-        def move_one(key, state, own, trace):
-            objective = composed(self.how, self.space, own)
-            state, trace = advance(self.refiner, key, state, trace, objective)
-            return _stop_at(self.target_loss, state), trace
-
-        iterations = now.iterations + running
-        keys = jax.vmap(jax.random.fold_in)(rows.keys, now.iterations + 1)
-        state, trace = jax.vmap(move_one)(keys, now.state, self.own, now.trace)
-        if self.callback is not None:
-            jax.debug.callback(self.callback, numbers(len(iterations)), iterations, trace)
-        return _Begun(state, trace, iterations)
+    return SearchState(state._replace(stop=stop), trace, previous.iterations)
 
 
 def _evaluation(prior, prepared, residual, penalty, codes, own) -> Evaluation:
@@ -312,54 +192,3 @@ def _best(
     better = jnp.argmin(finite_or_inf(losses).reshape(count, two), axis=1)
     row = two * jnp.arange(count) + better
     return codes.reshape(-1, d)[row], logits[row], losses[row]
-
-
-def keys_of(
-    keys: Key[Array, "*object"], codes: Float[Array, "object d"], prior: ShapePrior
-) -> Key[Array, " object"]:
-    """One key for each code, from one for each or one for all.
-
-    Args:
-        keys: One key for each code `[object]`, or one for all.
-        codes: Codes of the objects `[object d]`.
-        prior: The shape prior.
-
-    Raises:
-        ValueError: There are neither as many keys as codes nor one, or codes have another size.
-    """
-    if codes.ndim != 2 or codes.shape[-1] != prior.code_size:
-        raise ValueError(
-            f"codes have shape {codes.shape}; give [object, {prior.code_size}], one code for each "
-            "object of the batch (code[None] for one object)."
-        )
-    return one_key_each(keys, len(codes))
-
-
-def one_key_each(keys: Key[Array, "*object"], count: int) -> Key[Array, " object"]:
-    """One key for each object, from one for each or one for all.
-
-    Args:
-        keys: One key for each object `[object]`, or one for all.
-        count: Number of objects.
-
-    Raises:
-        ValueError: There are neither as many keys as objects nor one.
-    """
-    if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
-        keys = jax.random.wrap_key_data(keys)
-    if keys.ndim == 0:
-        return jax.random.split(keys, count)
-    if keys.shape != (count,):
-        raise ValueError(
-            f"There are keys of shape {keys.shape} for {count} objects; give one for each, "
-            "jax.random.split(key, objects), or a single one."
-        )
-    return keys
-
-
-def _stop_at(target_loss: Float[Array, ""] | float | None, states: Any) -> Any:
-    """The states; objects whose loss has reached the target are stopped."""
-    if target_loss is None:
-        return states
-    reached = states.best.loss <= target_loss
-    return states._replace(stop=jnp.where(reached, StopReason.TARGET, states.stop))
