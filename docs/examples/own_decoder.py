@@ -1,4 +1,4 @@
-"""A shape prior of your own: a coordinate decoder as in DeepSDF, without an encoder.
+"""Your own shape prior: a coordinate decoder as in DeepSDF, without an encoder.
 
 python docs/examples/own_decoder.py    # half a minute; it prints:
 Chairs it never saw: IoU 0.28 with the mean code, 0.42 after the search.
@@ -13,7 +13,7 @@ import jaxshape as js
 
 CHAIRS, STEPS = 48, 600
 GRID = jnp.stack(jnp.meshgrid(*[jnp.linspace(-1, 1, 32)] * 3, indexing="ij"), -1).reshape(-1, 3)
-WAVES = jnp.sin(GRID @ (6 * normal(key(0), (3, 96))) + jnp.arange(96))  # of each voxel's place
+WAVES = jnp.sin(GRID @ (6 * normal(key(0), (3, 96))) + jnp.arange(96))  # per voxel position
 SIZES = {"place": (96, 64), "code": (8, 64), "hidden": (64, 64), "out": (64,)}
 
 
@@ -22,7 +22,7 @@ def mlp(params, codes, waves):  # logits [code voxel]
     return jax.nn.relu(h @ params["hidden"]) @ params["out"] - 3
 
 
-def loss(both, voxels):  # of the weights and the codes of all chairs, found together
+def loss(both, voxels):  # for the weights and the codes of all chairs, trained together
     logits, truth = mlp(*both, WAVES[voxels]), surfaces.reshape(CHAIRS, -1)[:, voxels]
     return jnp.mean((1 + 2 * truth) * optax.sigmoid_binary_cross_entropy(logits, truth))
 

@@ -1,4 +1,4 @@
-"""A search of your own on the board of the benchmark: descent whose steps grow while they help.
+"""Your own search on the board of the benchmark: descent whose steps grow while they succeed.
 
 python docs/examples/own_entry.py board/    # a few minutes; then draw the board:
 jaxshape bench --methods "" --output board
@@ -17,7 +17,7 @@ BUDGET, PROBLEMS = 512, {"objects": 8, "frames": (4,)}
 def descend(watch, slope_of, number):
     """Steps along the gradient, longer after each gain, half as long after each loss."""
     space, length = js.whitened(watch.problems[0].prior), 1.0
-    watch.begin(number)  # its decoder calls and its clock
+    watch.begin(number)  # starts to count its decoder calls and its time
     point = space.from_code(watch.problems[number].first_code)
     loss, slope = slope_of(space, point, number)
     while not watch.spent(number):

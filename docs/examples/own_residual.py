@@ -1,4 +1,4 @@
-"""A residual of your own, with data of your own: the outlines of an object, beside Eq. 7.
+"""Your own residual, with your own data: the outlines of an object, in addition to Eq. 7.
 
 python docs/examples/own_residual.py    # half a minute; it prints:
 Four chairs in one frame: IoU 0.54 by Eq. 7 alone, 0.57 with their outlines.
@@ -9,18 +9,18 @@ import jax.numpy as jnp
 
 import jaxshape as js
 
-WEIGHT = 0.3  # of a pixel of an outline, in voxels
+WEIGHT = 0.3  # weight of the outlines' mean over pixels, relative to the mean over voxels
 
 
-def target(grids, first_logits):  # once for each object
+def target(grids, first_logits):  # computed once for each object
     return js.BALANCED.target(grids, first_logits), grids.data
 
 
-def score(logits, target):  # of every candidate, in nats per voxel
+def score(logits, target):  # computed for every candidate, in nats per voxel
     equation_7, outlines = target
     loss = js.BALANCED.score(logits, equation_7)
     for axis in range(3):
-        # log(1 - p), summed along a line of sight: the log-probability that it meets nothing
+        # log(1 - p), summed along a line of sight: the log-probability that all its voxels are free
         free = -jax.nn.softplus(logits).sum(axis) - 1e-6
         occupied = jnp.log(-jnp.expm1(free))
         loss -= WEIGHT * jnp.where(outlines[axis], occupied, free).mean()

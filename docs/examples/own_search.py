@@ -1,4 +1,4 @@
-"""A search of your own: momentum, with eight lengths of the step tried at once.
+"""Your own search: gradient descent with momentum, which tries eight step lengths at once.
 
 python docs/examples/own_search.py    # half a minute; it prints:
 After 264 decoder calls: objective 0.0355, IoU 0.686; Adam: objective 0.0349, IoU 0.680.

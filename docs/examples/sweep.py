@@ -1,4 +1,4 @@
-"""A sweep: 8 lengths of Adam's steps by 8 weights of the prior, over all objects in one program.
+"""A sweep over 8 step sizes of Adam and 8 weights of the prior, for all objects in one program.
 
 python docs/examples/sweep.py    # a minute; it prints which of the 64 settings does best
 """
@@ -18,7 +18,7 @@ truth = jnp.stack([one.surface for one in seen])
 prior = js.load_prior("chair-autoencoder")
 
 
-def score(step_size, prior_weight):  # numbers that JAX traces: no value is known here
+def score(step_size, prior_weight):  # traced by JAX: their values are not known here
     config = js.RefineConfig(iterations=ITERATIONS, step_size=step_size, prior_weight=prior_weight)
     adam = js.refiner_for("gradient:adam", prior, config)
     found = js.reconstruct(jax.random.key(0), prior, F, M, adam, config)

@@ -2,9 +2,8 @@
 # # Gradients against CMA-ES
 #
 # The paper searches the code of an auto-encoder by CMA-ES, a population search that needs no
-# derivatives. The decoder is a JAX function, so that its gradient is available, too. Which search
-# needs fewer decoder calls? A gradient counts as three calls here, since it takes the time of
-# three.
+# derivatives. The decoder is a JAX function, so its gradient is available, too. Which search needs
+# fewer decoder calls? A gradient counts as three calls here, because it takes the time of three.
 
 # %%
 from functools import partial
@@ -52,9 +51,9 @@ found = {method: search(method) for method in PRICE}
 # %% [markdown]
 # ## Results
 #
-# The objective is Eq. 7 of the paper, in nats per voxel. The left figure shows the mean over
-# chairs of the best value so far, against decoder calls; the right one the IoU of the refined
-# shapes with the true surface.
+# The objective is Eq. 7 of the paper, in nats per voxel. The left figure shows the best value so
+# far, averaged over the chairs, against decoder calls. The right figure shows the IoU of the
+# refined shapes with the true surface.
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.5))
@@ -74,6 +73,6 @@ right.legend()
 plt.show()
 
 # %% [markdown]
-# Adam falls fastest: it needs 128 calls to reach the level that CMA-ES reaches with 2,048. More
-# calls bring all searches to the same objective and the same shape. Try other names in `PRICE`,
-# such as `gradient:lbfgs`, or a search of your own (`docs/extending.md`).
+# Adam's objective decreases fastest: Adam needs 128 calls to reach the objective that CMA-ES
+# reaches with 2,048. With more calls, all searches reach the same objective and the same shape. Try
+# other names in `PRICE`, such as `gradient:lbfgs`, or a search of your own (`docs/extending.md`).

@@ -1,9 +1,9 @@
 # %% [markdown]
-# # An own category: from a folder of meshes to a rebuilt object
+# # Your own category: from a folder of meshes to a rebuilt object
 #
 # The shipped weights know chairs. For another category, jaxshape needs a folder of meshes and one
-# command. Here the category is tables; a few seconds of training with principal components stand
-# for the network, which takes hours on a CPU.
+# command. Here the category is tables. Principal components, trained in a few seconds, replace the
+# network, whose training takes hours on a CPU.
 
 # %%
 import subprocess
@@ -22,8 +22,8 @@ TABLES, CODE = 80, 32
 # %% [markdown]
 # ## 1. A folder of meshes
 #
-# Yours would come from files: OBJ, OFF, PLY, GLB or STL, all with the same axes up and to the
-# front. `jaxshape train --up z --front -y` states other axes than +y up and +z to the front.
+# Your meshes would come from files: OBJ, OFF, PLY, GLB or STL, all with the same up and front axes.
+# If these are not +y up and +z to the front, state them: `jaxshape train --up z --front -y`.
 
 # %%
 folder = Path("tables")
@@ -46,8 +46,8 @@ print(Path("out/table/table.md").read_text()[:600])
 # %% [markdown]
 # ## 3. Rebuild
 #
-# The weights take the place of the shipped ones. On the command line that is `jaxshape
-# reconstruct scan/ --weights out/table/table.safetensors`.
+# The new weights replace the shipped ones. On the command line, use `jaxshape reconstruct scan/
+# --weights out/table/table.safetensors`.
 
 # %%
 prior = js.load_prior("out/table/table.safetensors")

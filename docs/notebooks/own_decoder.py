@@ -1,10 +1,10 @@
 # %% [markdown]
-# # An own decoder: principal components
+# # Your own decoder: principal components
 #
-# A shape prior is a `ShapeModel`, two pure functions, with its parameters and the statistics of
-# the training codes. Here the decoder is linear: a code weighs the principal components of
-# training chairs. It trains by one singular value decomposition. `docs/examples/own_decoder.py`
-# has a neural decoder in the manner of DeepSDF.
+# A shape prior is a `ShapeModel`, two pure functions, with its parameters and the statistics of the
+# training codes. Here the decoder is linear: a code holds the weights of the principal components
+# of training chairs. One singular value decomposition trains it. `docs/examples/own_decoder.py` has
+# a neural decoder in the manner of DeepSDF.
 
 # %%
 import jax
@@ -16,7 +16,7 @@ from jaxshape.report.pictures import render_voxels
 
 CHAIRS, CODE = 120, 24
 SLOPE = 8.0  # logits rise by 8 from an empty to a full voxel
-NOISE = 0.3  # deviation of a voxel from the best linear fit
+NOISE = 0.3  # standard deviation of a voxel from the best linear fit
 
 # %% [markdown]
 # ## Training data
@@ -46,8 +46,9 @@ params = {"mean": mean, "components": components}
 # %% [markdown]
 # ## The model
 #
-# `decode` takes codes `[n d]` to logits `[n x y z]`. `encode` takes F and M of a batch to first
-# codes: the most probable code given the known voxels, which solves a small linear system.
+# `decode` maps codes `[n d]` to logits `[n x y z]`. `encode` maps F and M of a batch to first
+# codes. The first code is the most probable code given the known voxels, the solution of a small
+# linear system.
 
 
 # %%
@@ -74,7 +75,7 @@ js.save_prior("linear.safetensors", prior, {"data": f"{CHAIRS} procedural side c
 # %% [markdown]
 # ## Search
 #
-# Everything of the package works with the new prior. Adam searches the codes of two new chairs.
+# All functions of the package work with the new prior. Adam searches the codes of two new chairs.
 
 # %%
 new = [film(seed, 4) for seed in (1_000_001, 1_000_002)]

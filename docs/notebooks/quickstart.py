@@ -2,8 +2,8 @@
 # # Quickstart: a whole chair from four depth frames
 #
 # A virtual Kinect films a chair from four sides. jaxshape fuses the frames, and a network that
-# was trained on other chairs predicts the voxels that no frame has seen. Half a minute on a
-# laptop.
+# was trained on other chairs predicts the voxels that no frame has seen. This takes half a minute
+# on a laptop.
 
 # %%
 import jax
@@ -41,9 +41,9 @@ measured = (grids.occupied > 0.5) & (grids.occluded < 0.5)
 # %% [markdown]
 # ## Complete
 #
-# `reconstruct` takes a batch of objects, here of one. The default network needs no search, so
-# that the refiner is `None`. The composed grid keeps measured voxels and takes the others from
-# the network.
+# `reconstruct` takes a batch of objects, here one object. The default network needs no search, so
+# the refiner is `None`. The composed grid keeps measured voxels and takes the others from the
+# network.
 
 # %%
 prior = js.load_prior()
@@ -56,8 +56,8 @@ print(f"IoU with the true surface: {before:.3f} measured, {after:.3f} composed")
 # %% [markdown]
 # ## The mesh
 #
-# The mesh has the camera's resolution where the surface was measured. `measured` marks these
-# vertices, drawn in blue; predicted vertices are orange.
+# The mesh has the camera's resolution where the surface was measured. `measured` marks the measured
+# vertices, which are drawn in blue; predicted vertices are orange.
 
 # %%
 fused = js.fuse_surface(jax.tree.map(lambda x: x[0], field), found.fill_logits[0], film.frame)

@@ -2,8 +2,8 @@
 # # A recording: from RGB-D files to a mesh
 #
 # This notebook writes a small recording in the layout of the TUM RGB-D benchmark, inspects it,
-# and maps it frame by frame. For a recording of your own, begin at "Open"; the same from the
-# shell is `jaxshape reconstruct scan/ --click COLUMN ROW`.
+# and maps it frame by frame. For your own recording, begin at "Open". From the shell, `jaxshape
+# reconstruct scan/ --click COLUMN ROW` does the same.
 
 # %%
 from dataclasses import replace
@@ -23,9 +23,9 @@ FRAMES, WIDTH, HEIGHT = 12, 640, 480
 # %% [markdown]
 # ## Write a recording
 #
-# A chair on a floor, filmed by a virtual Kinect along an arc. Depth images are 16-bit PNG files
-# with 5,000 units in a metre. `groundtruth.txt` has a line `time x y z qx qy qz qw` for each
-# pose, camera to world.
+# A virtual Kinect films a chair on a floor along an arc. Depth images are 16-bit PNG files
+# with 5,000 units per metre. `groundtruth.txt` has a line `time x y z qx qy qz qw` for each
+# camera-to-world pose.
 
 # %%
 folder = Path("scan")
@@ -64,12 +64,12 @@ print(f"{len(sequence)} frames, layout {sequence.layout}, {len(sequence.findings
 # %% [markdown]
 # ## Find the object
 #
-# A box is known here. Without `box`, `js.Prompt(click=(column, row))` names a pixel of the
+# The box is known here. Without `box`, `js.Prompt(click=(column, row))` names a pixel of the
 # object, and `find_start` segments it and estimates the box.
 
 # %%
 size = chair.extents * 1.04
-above = np.array([[[-9, -9, -9], [9, 0.03 - size[1] / 2, 9]]])  # without the floor
+above = np.array([[[-9, -9, -9], [9, 0.03 - size[1] / 2, 9]]])  # excludes the floor
 prior, config = js.load_prior(), js.RefineConfig()
 box = js.Box(np.eye(4), size, above)
 start = js.find_start(sequence, prior, js.Prompt(), box=box)
@@ -77,7 +77,8 @@ start = js.find_start(sequence, prior, js.Prompt(), box=box)
 # %% [markdown]
 # ## Map
 #
-# `follow` yields the progress after each frame. Frames that moved enough become keyframes.
+# `follow` yields the progress after each frame. A frame becomes a keyframe if the camera has moved
+# enough since the last keyframe.
 
 # %%
 mapper = js.build_mapper(prior, None, config, js.MappingConfig(), js.TrackingConfig())

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Uncertainty and next views
 #
-# One depth frame shows half of a chair. Many chairs agree with it. This notebook draws samples of
-# the complete shape, shows where they disagree, and finds the camera position that would resolve
-# most of the uncertainty.
+# One depth frame shows half of a chair, and many chairs agree with this frame. This notebook draws
+# samples of the complete shape, shows where they disagree, and finds the camera position that would
+# resolve most of the uncertainty.
 
 # %%
 import jax
@@ -29,7 +29,7 @@ grids = js.soft_grids(js.fuse_frames(film, (1,)))
 # %% [markdown]
 # ## Samples
 #
-# `samples` in the settings asks for samples of the posterior. `found.probability` is the
+# The setting `samples` requests samples of the posterior. `found.probability` is the
 # calibrated probability of surface in each voxel; `found.samples` are logits of complete shapes.
 
 # %%
@@ -42,8 +42,8 @@ entropy = -p * jnp.log(p) - (1 - p) * jnp.log1p(-p)
 print(f"entropy of the shape: {float(entropy.sum()):.0f} nats")
 
 # %% [markdown]
-# The two samples that differ most, with their probabilities, and the entropy of the voxels,
-# summed along the line of sight from the side.
+# The figure shows the two samples that differ most, with their probabilities, and the entropy of
+# the voxels, summed along the line of sight from the side.
 
 # %%
 figure, axes = plt.subplots(1, 4, figsize=(13, 3.3))
