@@ -40,8 +40,8 @@ class Output(NamedTuple):
     def kept(self) -> str:
         """The files left by a stopped command, as a sentence."""
         if self.goes_on:
-            return "What was finished is kept; the same command goes on from there."
-        return "Give the same command again to make it anew."
+            return "Finished parts are kept; give the same command again to resume."
+        return "Give the same command again to start over."
 
 
 @contextmanager

@@ -16,10 +16,10 @@ TEMPORARY = ".writing-"
 _REASONS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota of its disk is used up",
-    errno.EFBIG: "a file may not become as large there",
+    errno.EFBIG: "a file of this size is not allowed there",
     errno.EROFS: "its disk is read-only",
-    errno.EACCES: "permission to write there is missing",
-    errno.EPERM: "permission to write there is missing",
+    errno.EACCES: "you have no permission to write there",
+    errno.EPERM: "you have no permission to write there",
     errno.ENOENT: "it was removed meanwhile",
     errno.ENOTDIR: "a part of the path is a file",
     errno.EEXIST: "a part of the path is a file",

@@ -121,7 +121,8 @@ def join_processes(
     if 0 < len(missing) < len(given):
         raise ValueError(
             f"Without {' and '.join(missing)} the processes cannot find each other; give "
-            "coordinator, processes and process, or none where a cluster such as Slurm tells them."
+            "coordinator, processes and process, or none of them if a cluster such as Slurm sets "
+            "them."
         )
     import jax
 

@@ -108,12 +108,12 @@ def test_a_disk_that_fills_leaves_what_was_there_and_says_whether_to_go_on(
 
     status, _, err = start(tmp_path / "out", fills)
     assert status == 2 and "cannot be written: the disk is full." in err
-    assert ("the same command goes on from there" in err) == (name in GO_ON)
+    assert ("give the same command again to resume" in err) == (name in GO_ON)
     assert [path.name for path in tmp_path.rglob("*.*")] == ["first.txt"]
 
 
 @pytest.mark.parametrize("problem, said", [
-    (MemoryError(), "The memory of this machine does not suffice."),
+    (MemoryError(), "This machine does not have enough memory for this command."),
     (FileNotFoundError(2, "No such file or directory", "gone.png"), "'gone.png' cannot be read"),
     (OSError("[/red] is no markup."), "[/red] is no markup."),
 ])  # fmt: skip
@@ -156,7 +156,7 @@ def test_a_signal_ends_a_command_in_order(tmp_path, number, status):
         _, err = process.communicate(timeout=60)
     assert process.returncode == status
     assert err.strip() == (
-        "stopped. What was finished is kept; the same command goes on from there."
+        "stopped. Finished parts are kept; give the same command again to resume."
     )
     assert os.listdir(tmp_path / "out") == ["first.txt"]
 

@@ -357,7 +357,7 @@ def test_a_training_run_that_cannot_be_is_refused(refused, tmp_path, options, sa
 
 def test_a_collection_of_meshes_that_cannot_be_trained_on_is_refused(chair, refused, tmp_path):
     assert "either --dataset FOLDER or --meshes FOLDER" in refused("train")
-    assert "give two or more" in refused("train", "--meshes", chair)
+    assert "two or more shapes" in refused("train", "--meshes", chair)
     assert "must be perpendicular" in refused("train", "--meshes", chair, "--front", "-y")
     assert "no file or folder" in refused("train", "--meshes", tmp_path / "nowhere")
 
@@ -564,7 +564,7 @@ def scores_of(**best):
 @pytest.mark.parametrize(
     ("fronts", "lying", "said"),
     [
-        ("xxxz", [], "3 of 4 meshes that were looked at seem to face another way, 'a' for one; "
+        ("xxxz", [], "3 of 4 meshes that were looked at seem to face another way, for example 'a'; "
          "give --up y --front x."),
         ("zzzx", [], "1 of 4 meshes that were looked at seem to face another way than the rest: d"),
         ("zzzz", ["c"], "1 of 4 meshes seem to lie on their side, if they are seats: c; --axes "),

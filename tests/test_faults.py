@@ -225,10 +225,10 @@ def test_a_run_can_be_watched_killed_and_gone_on_with(
     status, _, err = run(*given, "--seed", 1)
     assert status == 2 and "unfinished reconstruction with other settings" in err
     status, _, err = run(*given, "--every", 2)
-    assert status == 2 and "--fresh to begin anew" in err
+    assert status == 2 and "--fresh to start over" in err
 
     status, out, err = run(*given)
-    assert status == 0 and "going on after frame" in err, err
+    assert status == 0 and "resuming after frame" in err, err
     result = json.loads((there / "result.json").read_text())
     assert "running" not in result and not (there / STATE).exists()
     assert result["frames"] == result["frames_tracked"] == len(walk.depth)
@@ -285,7 +285,7 @@ def test_a_process_is_killed(run, folder, tmp_path, known_weights, poses):
         process.send_signal(signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL and frames_kept(there) < 14
     again = subprocess.run(argv, env=environment, capture_output=True, text=True)
-    assert again.returncode == 0 and "going on after frame" in again.stderr, again.stderr
+    assert again.returncode == 0 and "resuming after frame" in again.stderr, again.stderr
 
     for name in ("grid.npz", "trace.npz"):
         with np.load(there / name) as ours, np.load(tmp_path / "undisturbed" / name) as whole:

@@ -52,7 +52,7 @@ def test_a_table_and_warnings(inspect, folder):
         "4, frame-0 to frame-4, 64 x 48 pixels",
         "fx 60.0, fy 60.0, cx 32.0, cy 24.0 (camera-intrinsics.txt)",
         "1000 units a metre: median 2.00 m; 0% invalid, 0% saturated (4 frames read)",
-        "4 of 4 frames, a way of 0.00 m; too little motion to tell whether they fit",
+        "4 of 4 frames, a path of 0.00 m; too little motion to tell whether they fit",
         "1 after frame-2",
         "warning missing frames: 1, the most (1) between frame-2 and frame-4. Tracking may",
     ):

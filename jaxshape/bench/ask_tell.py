@@ -88,7 +88,9 @@ def nevergrad(variant: str | None, dim: int, config: RefineConfig) -> AskTell:
     ng = _imported("nevergrad")
     name = variant or "NGOpt"
     if name not in ng.optimizers.registry:
-        raise ValueError(f"nevergrad has no optimiser {name!r}; NGOpt and TwoPointsDE are some.")
+        raise ValueError(
+            f"nevergrad has no optimiser {name!r}; choose, for example, NGOpt or TwoPointsDE."
+        )
 
     class Search:
         def __init__(self, seed, point, loss):

@@ -125,7 +125,7 @@ def read_entry(path: Path) -> Entry:
     except (ValueError, KeyError, TypeError, AttributeError):
         is_entry = False
     if not is_entry:
-        raise ValueError(f"{str(path)!r} is no entry of the benchmark ({FORMAT}).")
+        raise ValueError(f"{str(path)!r} is not an entry of the benchmark ({FORMAT}).")
     return Entry(content, machines, rows)
 
 

@@ -94,7 +94,7 @@ def standings(entries: Sequence[Entry], best: dict[str, float]) -> list[Standing
     names = shared_problems(entries)
     if not names:
         raise ValueError(
-            "No problem has results of all entries, so that they cannot be compared; run the"
+            "No problem has results of all entries, so they cannot be compared; run the"
             " methods on the same problems, or give a folder with fewer entries."
         )
     lowest = np.array([best[name] for name in names])[:, None]

@@ -108,7 +108,7 @@ def main() -> None:
 def _sentence(problem: Exception, output: Output | None) -> str:
     """The error as a sentence, with the files that are left."""
     if isinstance(problem, MemoryError):
-        return "The memory of this machine does not suffice."
+        return "This machine does not have enough memory for this command."
     if isinstance(problem, OutputError):
         return str(problem) if output is None else f"{problem} {output.kept}"
     if isinstance(problem, OSError) and problem.strerror and problem.filename:

@@ -92,7 +92,10 @@ def turned(sources: Sequence[Any], axes: Axes, prior: Any = None) -> list[Any]:
 
     scores = _scores(sources, axes, prior)
     if not scores:
-        warn("--axes auto knows only seats, and these are none; --up and --front apply.")
+        warn(
+            "--axes auto works for seats only, and these meshes are not seats; --up and --front "
+            "are used instead."
+        )
         return list(sources)
     usual = usual_axes(scores, (axes.up, axes.front))
     others = dissenting(scores, usual)
@@ -126,8 +129,8 @@ def check_axes(
             return
         standing = usual_axes(scores, ("z", "-y"))
         complaint = (
-            f"{len(lying)} of {count} meshes seem to lie on their side, {lying[0]!r} for one{{}}; "
-            f"name the axis that points up, for example {_flags(standing)}."
+            f"{len(lying)} of {count} meshes seem to lie on their side{{}}, for example "
+            f"{lying[0]!r}; name the axis that points up, for example {_flags(standing)}."
         )
         require(not refuse, complaint.format(""))
         return warn(complaint.format(", if they are seats"))
@@ -143,7 +146,7 @@ def check_axes(
     if usual != given and 2 * len(others) > len(scores):
         warn(
             f"{len(others)} of {len(scores)} meshes that were looked at seem to face another way, "
-            f"{next(iter(others))!r} for one; give {_flags(usual)}."
+            f"for example {next(iter(others))!r}; give {_flags(usual)}."
         )
     elif others:
         warn(

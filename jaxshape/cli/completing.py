@@ -100,6 +100,6 @@ def _of_rays(cloud: Any) -> list[str]:
     if cloud.sensor is not None or cloud.normals is not None:
         return []
     return [
-        "Neither the sensor's position nor normals are known, so that holes cannot be told from "
-        "unseen surface; give --sensor, or a file with normals."
+        "Neither the sensor's position nor normals are known, so free space cannot be "
+        "distinguished from unseen surface; give --sensor, or a file with normals."
     ]

@@ -80,7 +80,7 @@ def advice(device: str) -> Iterator[str]:
         if features and "amx_bf16" not in features:
             yield "The processor has no matrix units for bfloat16: leave --bfloat16 out."
         if (os.cpu_count() or 1) < 4:
-            yield "Training has few cores to spread over; a GPU is used where JAX finds one."
+            yield "Training will be slow on so few CPU cores; a GPU is used if JAX finds one."
         if which("nvidia-smi") or which("rocm-smi"):
             yield "There is a GPU, and JAX does not see it: pip install 'jaxshape[cuda]'."
     if find_spec("embreex") is None:

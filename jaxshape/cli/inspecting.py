@@ -183,7 +183,7 @@ def _gap_row(gaps: list[dict[str, Any]]) -> str:
 def _pose_row(poses: dict[str, Any] | None, count: int) -> str:
     if poses is None:
         return "none: the camera has to be tracked"
-    row = f"{poses['known']} of {count} frames, a way of {poses['length']:.2f} m; "
+    row = f"{poses['known']} of {count} frames, a path of {poses['length']:.2f} m; "
     if not poses["pairs"]:
         return row + "too little motion to tell whether they fit"
     row += f"{poses['agreement']:.0%} of the pixels of {poses['pairs']} pairs of frames agree"

@@ -31,10 +31,10 @@ class Rebuild:
         str | None,
         tyro.conf.arg(
             metavar="METHOD",
-            help="How the first code is searched on; None for cma, or for no search with a network "
-            "that is conditioned on what was measured: encoder (no search), "
-            f"{', '.join(families())}, a variant ({VARIANTS}), or a function of yours by its "
-            "import path, package.module:function.",
+            help="The search that starts from the first code: encoder (no search), "
+            f"{', '.join(families())}, a variant ({VARIANTS}), or your own function by its import "
+            "path, package.module:function. None stands for cma, or for encoder with a network "
+            "that is conditioned on the measurement.",
         ),
     ] = None
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig(samples=16)
@@ -152,7 +152,7 @@ class Demo(Rebuild):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole("frames", self.frames, 1, limits.FRAMES, "that is ten times around")
+        checks.whole("frames", self.frames, 1, limits.FRAMES, "that is ten full orbits")
 
     @property
     def writes(self) -> Output:

@@ -143,7 +143,7 @@ class Reconstruct(Rebuild):
                 )
         else:
             seen = earlier.start
-            console.print(f"going on after frame {earlier.logs[-1].name}", markup=False)
+            console.print(f"resuming after frame {earlier.logs[-1].name}", markup=False)
         for note in seen.notes:
             console.print(note, highlight=False, markup=False)
         chosen = range(seen.index, len(sequence), self.every)
@@ -190,13 +190,13 @@ class Reconstruct(Rebuild):
         use_pose = self.poses != "none" and sequence.has_poses
         _, frame = first_readable(sequence, self.first, use_pose)
         found = propose(frame.depth, frame.intrinsics)
-        require(bool(found), f"{frame.name} shows floor and walls alone; give another --first.")
+        require(bool(found), f"{frame.name} shows only floor and walls; give another --first.")
         picture = self.output / "objects.png"
         write_proposals(picture, frame.depth, frame.color, [one.segmented for one in found])
         for number, one in enumerate(found, 1):
             size = " x ".join(f"{extent:.2f}" for extent in one.size)
             print(f"{number}: {size} m (width, height, depth), {one.distance:.2f} m away")
-        print(f"wrote {picture} of {frame.name}; take one with --object and its number")
+        print(f"wrote {picture} of {frame.name}; choose an object with --object and its number")
 
     def _conclude(self, progress: Any, result: dict[str, Any]) -> None:
         """Draw the pictures and the report, and print a summary."""
@@ -247,7 +247,7 @@ def opened(
             guess_camera or not sequence.camera_is_guess,
             f"{str(frames)!r} holds no camera, and a focal length that is wrong by 5 % bends "
             "the surface: write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt there, or add "
-            f"--guess-camera to take that of {sequence.camera}.",
+            f"--guess-camera to use that of {sequence.camera}.",
         )
         keep_scale = depth_scale is not None
         found = inspect_sequence(sequence, convention or None, keep_scale=keep_scale)
@@ -266,7 +266,7 @@ def poses_used(found: Any, frames: Path, poses: str) -> bool:
     if poses in ("none", "first") or not has_poses:
         return False
     best = read.reading.best
-    hint = "" if best is None else f"{best.convention.options} would make it {best.share:.0%}; "
+    hint = "" if best is None else f"with {best.convention.options} it is {best.share:.0%}; "
     require(
         read.reading.pairs == 0 or read.agreement >= BADLY,
         f"The poses in {str(frames)!r} agree with the depth images on "

@@ -138,9 +138,9 @@ def _exit_code(worker: _Worker) -> int:
     code = worker.process.exitcode or 0
     if not worker.is_ready:
         raise WorkersDied(
-            f"A worker process ended with exit status {code} before it began; the same command "
-            "goes on, with fewer --workers where memory is short. (A script has to start processes "
-            "under `if __name__ == '__main__':`.)"
+            f"A worker process ended with exit status {code} before it began; give the same "
+            "command again to resume, with fewer --workers if memory is short. (A script has to "
+            "start processes under `if __name__ == '__main__':`.)"
         )
     return code
 

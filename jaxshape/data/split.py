@@ -42,8 +42,8 @@ def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[MeshSou
     count = len(set(groups))
     if count < 2:
         raise ValueError(
-            f"There {'is 1 mesh' if len(usable) == 1 else f'are {len(usable)} meshes'} of {count} "
-            "shape that can be used; give two or more, to train on some and score on others."
+            f"{'Only 1 mesh' if len(usable) == 1 else f'{len(usable)} meshes'} of {count} shape "
+            "can be used; give meshes of two or more shapes, to train on some and score on others."
         )
     marks: dict[int, float] = {}
     for group, mesh in zip(groups, usable, strict=True):

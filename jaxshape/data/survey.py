@@ -136,8 +136,8 @@ def doubted_size(sizes: Sequence[float], unit: UnitName) -> str | None:
     remedy = f"give {' or '.join(fitting)}" if fitting else "scale the files"
     return (
         f"The {len(sizes)} meshes have a median size of {median:.3g} m if their unit is {unit}, "
-        f"which nothing in a room has; {remedy}. The noise of a depth camera depends on sizes: "
-        "meshes below 5 cm or above 10 m are filmed as if they measured 1 m."
+        f"a size that nothing in a room has; {remedy}. The noise of a depth camera depends on "
+        "sizes: meshes below 5 cm or above 10 m are filmed as if they were 1 m large."
     )
 
 

@@ -43,7 +43,9 @@ class Architecture:
         checks.one_of("occlusion", self.occlusion, (True, False))
         for name in ("encoder", "decoder"):
             _check_channels(name, getattr(self, name))
-        checks.whole("code", self.code, 2, limits.CODE, "its covariance has the square")
+        checks.whole(
+            "code", self.code, 2, limits.CODE, "the covariance of codes has the square of that"
+        )
         if len(self.encoder) != len(self.decoder) + 1:
             raise ValueError(
                 f"The encoder has {len(self.encoder)} layers and the decoder "
@@ -79,7 +81,9 @@ class Completion:
     def __post_init__(self) -> None:
         _check_channels("channels", self.channels)
         checks.whole("depth", self.depth, 1, limits.CHANNELS)
-        checks.whole("code", self.code, 2, limits.CODE, "its covariance has the square")
+        checks.whole(
+            "code", self.code, 2, limits.CODE, "the covariance of codes has the square of that"
+        )
         if not 8 <= self.resolution <= limits.RESOLUTION or self.resolution % 8:
             checks.refuse(
                 "resolution", self.resolution, f"a multiple of 8, up to {limits.RESOLUTION}"

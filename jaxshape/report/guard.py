@@ -87,4 +87,6 @@ def guarded(served: str) -> Iterator[None]:
     finally:
         server.serve = serve
     if not guards:
-        raise RuntimeError("This version of viser serves in another way; jaxshape cannot guard it.")
+        raise RuntimeError(
+            "jaxshape cannot filter the requests to this version of viser; install another version."
+        )

@@ -180,7 +180,7 @@ def _keyframes(found: ResultFolder) -> str:
     chosen = [found.keyframes[round(i * (count - 1) / max(1, shown - 1))] for i in range(shown)]
     pictured = zip(chosen, illustrations.keyframes(chosen), strict=True)
     figures = "".join(_figure(p, k.name, tracked(k)) for k, p in pictured)
-    about = "Colour with the outline of the segmented object, and depth, near dark."
+    about = "Colour with the outline of the segmented object, and depth; near surfaces are dark."
     some = f" {shown} of {count} are pictured." if shown < count else ""
     return (
         f'<section><h2>Keyframes</h2><p class="soft">{about}{some}</p>'

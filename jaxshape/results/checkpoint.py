@@ -115,8 +115,8 @@ def load_state(
         raise _damaged(path, problem) from problem
     if not is_ours:
         raise SequenceError(
-            f"{folder} holds an unfinished reconstruction with other settings; give the same ones "
-            "to go on, another --output, or --fresh to begin anew."
+            f"{folder} holds an unfinished reconstruction with other settings; give the same "
+            "settings to resume it, another --output, or --fresh to start over."
         )
     try:
         start = _start(kept, about)
@@ -133,7 +133,7 @@ def load_state(
 
 def _damaged(path: Path, problem: Exception) -> SequenceError:
     return SequenceError(
-        f"{path} cannot be read ({problem}); remove it, or add --fresh to begin anew."
+        f"{path} cannot be read ({problem}); remove it, or add --fresh to start over."
     )
 
 

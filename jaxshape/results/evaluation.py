@@ -66,10 +66,10 @@ class EvaluateConfig(CameraConfig):
         if not self.frames:
             checks.refuse("frames", self.frames, "numbers of frames, 1 or more each")
         for number in self.frames:
-            checks.whole("frames", number, 1, limits.FRAMES, "that is ten times around")
+            checks.whole("frames", number, 1, limits.FRAMES, "that is ten full orbits")
 
 
-NOTHING = "No pixel of some number of frames meets the mesh: it is too thin for the camera."
+NOTHING = "For some number of frames, no pixel hits the mesh: it is too thin for the camera."
 
 
 class Case(NamedTuple):

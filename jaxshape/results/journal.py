@@ -113,6 +113,6 @@ def _read(path: Path) -> dict[str, Any]:
             raise ValueError(f"its {wrong[0]} are damaged")
     except (OSError, ValueError, KeyError) as problem:
         raise ValueError(
-            f"{str(path)!r} cannot be gone on with ({problem}); remove it to begin anew."
+            f"{str(path)!r} cannot be resumed ({problem}); remove it to start over."
         ) from problem
     return content

@@ -225,7 +225,7 @@ def keyframe_entries(sequence: Sequence, progress: Progress) -> dict[str, Any]:
 def _as_fused(progress: Progress) -> Iterator[FrameLog]:
     """The logs of all frames; a keyframe without the object counts as tracked only."""
     fused = {log.index for log, _ in _fused(progress)}
-    reason = "no pixel was taken for the object"
+    reason = "no pixel was segmented as the object"
     for log in progress.logs:
         is_empty = log.status == "keyframe" and log.index not in fused
         yield log._replace(status="tracked", reason=reason) if is_empty else log

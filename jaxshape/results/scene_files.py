@@ -249,12 +249,14 @@ def scene_warnings(scene: Scene) -> list[str]:
     """
     found = []
     if scene.level is None:
-        found.append("No floor was seen, and without it no objects: film the floor, too.")
+        found.append(
+            "No floor was seen, and objects are found only with the floor: film the floor, too."
+        )
     elif not scene.objects:
         found.append("Nothing of the size of an object stands on the floor or on a table.")
     for one in scene.tracks.things:
         if one.is_moved:
-            found.append(f"Something was moved while it was filmed, and left out: {one.number}.")
+            found.append(f"Object {one.number} was moved while it was filmed, and is left out.")
     return found
 
 

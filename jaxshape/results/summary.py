@@ -44,8 +44,8 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
         value = number(result["mesh_measured"], 0, times=100.0, unit=" %")
         left_out = number(result.get("mesh_pieces_dropped"))
         meaning = (
-            "of the mesh’s area is surface that the camera measured; the rest is what the prior "
-            f"makes of it. Loose pieces left out: {left_out}"
+            "of the mesh’s area is surface that the camera measured; the prior predicts the rest. "
+            f"Loose pieces left out: {left_out}"
         )
         yield Figure("Measured", value, meaning)
     if "iou_composed" in result:
@@ -89,7 +89,7 @@ def _judgement(result: dict[str, Any]) -> Iterator[Figure]:
     if "verdict" not in result or not isinstance(quality, dict):
         return
     reasons = "; ".join(map(str, entries(result.get("verdict_reasons"))))
-    yield Figure("Verdict", str(result["verdict"]), reasons or "nothing speaks against the result")
+    yield Figure("Verdict", str(result["verdict"]), reasons or "no problem was found")
     yield Figure("Size", _size(result), "width, height and depth of the object")
     percent = {"times": 100.0, "unit": " %"}
     parts = [
@@ -98,9 +98,9 @@ def _judgement(result: dict[str, Any]) -> Iterator[Figure]:
         if quality.get(name) is not None
     ]
     meaning = (
-        "of what the camera measured of the object lies within 1 cm of the mesh, give or take the "
-        f"camera’s noise. The mesh: {', '.join(parts) or 'not known what was measured'}; "
-        f"{number(quality.get('free_violated'), **percent)} lie where the camera saw through"
+        "of the measured points of the object lie within 1 cm of the mesh, or within the camera’s "
+        f"noise. Area of the mesh: {', '.join(parts) or 'not known what was measured'}; "
+        f"{number(quality.get('free_violated'), **percent)} lie in space that was measured as free"
     )
     yield Figure("Explained", number(quality.get("explained"), **percent), meaning)
 
@@ -125,8 +125,8 @@ def _minimised(result: dict[str, Any]) -> str:
     words = {
         "": "Eq. 7 or a variant of it",
         "paper": "Eq. 7 as printed",
-        "balanced": "Eq. 7, where measured free space counts a third",
-        "soft": "Eq. 7, where each voxel counts by how sure its measurement is",
+        "balanced": "Eq. 7 with a third of the weight on measured free space",
+        "soft": "Eq. 7 with each voxel weighted by the certainty of its measurement",
     }
     return words.get(name, f"the objective {name}")
 

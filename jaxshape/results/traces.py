@@ -78,12 +78,12 @@ def read_search(folder: str | os.PathLike[str]) -> Search:
         raise TraceError(f"{str(folder / 'result.json')!r} is damaged: {problem}.") from None
     if result.get("method") == "encoder":
         raise TraceError(
-            f"{str(folder)!r} holds the encoder's answer, for which nothing was searched; "
-            "choose another --method to have something to plot."
+            f"{str(folder)!r} holds the encoder's result, without a search; "
+            "choose another --method to get a search that can be plotted."
         )
     if not (folder / "trace.npz").is_file():
         raise TraceError(
-            f"{str(folder)!r} holds no trace.npz: it was made by a version that kept none. "
+            f"{str(folder)!r} holds no trace.npz: an earlier version, which wrote none, made it. "
             "Make it again."
         )
     return Search(folder.resolve().name, read_trace(folder / "trace.npz"), result)

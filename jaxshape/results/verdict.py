@@ -250,24 +250,24 @@ def judged(quality: Quality) -> Verdict:
 
 def _failures(q: Quality) -> Iterator[str]:
     if q.explained < FAILED:
-        yield f"the mesh explains only {q.explained:.0%} of what was measured of the object"
+        yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
     if q.free_violated > TORN:
-        yield f"{q.free_violated:.0%} of the mesh lie where the camera saw through"
+        yield f"{q.free_violated:.0%} of the mesh lie in space that was measured as free"
     if not SIZES[0] <= max(q.size) <= SIZES[1]:
         yield f"the object would be {max(q.size):.2g} m large"
     if q.keyframes and 2 * q.empty_keyframes >= q.keyframes:
-        yield f"in {q.empty_keyframes} of {q.keyframes} keyframes next to nothing was taken for it"
+        yield f"in {q.empty_keyframes} of {q.keyframes} keyframes the object has almost no pixels"
     if len(_unseen_sides(q)) >= ALL_GUESSED:
-        yield "where it ends was seen at none of its sides"
+        yield "the end of the object was not seen at any side"
     if q.unseen_below > MOSTLY_BARE:
-        yield f"nothing was measured of its lower {q.unseen_below:.0%}"
+        yield f"nothing was measured in its lower {q.unseen_below:.0%}"
 
 
 def _doubts(q: Quality) -> Iterator[str]:
     if q.explained < DOUBTFUL:
-        yield f"the mesh explains only {q.explained:.0%} of what was measured of the object"
+        yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
     if q.free_violated > SEEN_THROUGH:
-        yield f"{q.free_violated:.0%} of the mesh lie where the camera saw through"
+        yield f"{q.free_violated:.0%} of the mesh lie in space that was measured as free"
     if q.measured < LITTLE_MEASURED:
         yield f"only {q.measured:.0%} of the mesh were measured"
     if abs(q.floor_gap) > GAP:
@@ -276,11 +276,11 @@ def _doubts(q: Quality) -> Iterator[str]:
     if q.pieces > 1:
         yield f"the mesh is in {q.pieces} pieces"
     if q.empty_keyframes:
-        yield f"{q.empty_keyframes} of {q.keyframes} keyframes added next to nothing"
+        yield f"{q.empty_keyframes} of {q.keyframes} keyframes added almost nothing"
     if len(sides := _unseen_sides(q)) >= GUESSED:
-        yield f"where it ends was not seen at its {joined(sides)}"
+        yield f"the end of the object was not seen at its {joined(sides)}"
     if q.unseen_below > BARE:
-        yield f"its lower {q.unseen_below:.0%}, legs or what else is there, are predicted"
+        yield f"its lower {q.unseen_below:.0%}, for example the legs, is predicted"
 
 
 def _unseen_sides(q: Quality) -> tuple[str, ...]:

@@ -110,7 +110,7 @@ def test_results_of_one_name_that_differ_are_refused(entry, ran, two, tmp_path):
 def test_a_file_that_is_no_entry_is_told(tmp_path):
     for text in ("{}", "[]", "no JSON", '{"format": "jaxshape-bench-entry-1"}'):
         (tmp_path / "x.json").write_text(text)
-        with pytest.raises(ValueError, match="is no entry"):
+        with pytest.raises(ValueError, match="is not an entry"):
             read_entry(tmp_path / "x.json")
 
 

@@ -41,7 +41,7 @@ def test_what_an_item_raises_is_raised_here(tmp_path):
 
 def test_processes_that_cannot_begin_end_in_a_sentence(monkeypatch):
     monkeypatch.setattr(pool, "_serve", sys.exit)  # which is called with the function
-    with pytest.raises(WorkersDied, match="before it began; the same command goes on"):
+    with pytest.raises(WorkersDied, match="before it began; give the same command again"):
         list(in_processes(print, [1, 2, 3], 2))
 
 

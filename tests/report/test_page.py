@@ -131,7 +131,8 @@ def test_the_figures_are_told_with_their_units(page):
         f"{KEYFRAMES} of {len(STATUSES)}",
         "2 tracked, 1 lost, 1 unreadable",
         "0.5000 → 0.2500",
-        "nats per voxel of the whole grid (Eq. 7, where measured free space counts a third)",
+        "nats per voxel of the whole grid "
+        "(Eq. 7 with a third of the weight on measured free space)",
         "12.3 s",
         "87 % inliers, 4.2 mm",
         "only 12 % agree",

@@ -69,7 +69,9 @@ def test_a_checkpoint_is_small_and_forgotten_at_the_end(tmp_path, sequence, know
 
 def test_other_settings_are_refused(tmp_path, sequence, known, last_keyframe):
     save_state(tmp_path, last_keyframe, SETTINGS)
-    with pytest.raises(SequenceError, match="with other settings; give the same ones .* --fresh"):
+    with pytest.raises(
+        SequenceError, match="with other settings; give the same settings .* --fresh"
+    ):
         load(tmp_path, sequence, known, SETTINGS | {"seed": 1})
     assert load(tmp_path, sequence, known) is not None
 

@@ -53,7 +53,7 @@ def add_objects(folder):
         (lambda folder: (folder / "result.json").unlink(), "is not a result folder"),
         (lambda folder: (folder / "result.json").write_text("{"), "is damaged"),
         (lambda folder: (folder / "result.json").write_text('{"method": "encoder"}'), "encoder's"),
-        (lambda folder: (folder / "trace.npz").unlink(), "a version that kept none"),
+        (lambda folder: (folder / "trace.npz").unlink(), "an earlier version, which wrote none"),
         (lambda folder: (folder / "trace.npz").write_bytes(b""), "cannot be read"),
         (lambda folder: (folder / "trace.npz").write_bytes(b"PK noise"), "cannot be read"),
         (lambda folder: np.savez(folder / "trace.npz", other=np.zeros(2)), "cannot be read"),

@@ -219,11 +219,11 @@ def _bent(
         joints = joints @ np.swapaxes(inverse, 1, 2)[: len(joints)]
     sets = sorted(name.removeprefix("JOINTS_") for name in attributes if "JOINTS_" in name)
     if not sets:
-        raise Unreadable("A mesh has a skin, but its vertices hang on no joint.")
+        raise Unreadable("A mesh has a skin, but its vertices are bound to no joint.")
     joint = np.concatenate([attributes[f"JOINTS_{s}"] for s in sets], axis=1).astype(np.int64)
     weight = np.concatenate([attributes[f"WEIGHTS_{s}"] for s in sets], axis=1).astype(float)
     if joint.size and joint.max() >= len(joints):
-        raise Unreadable("A vertex hangs on a joint that the skin does not have.")
+        raise Unreadable("A vertex is bound to a joint that the skin does not have.")
     total = weight.sum(axis=1)
     weight = weight / np.where(total > 0, total, 1)[:, None]
     homogeneous = np.append(vertices, np.ones((len(vertices), 1)), axis=1)

@@ -42,7 +42,7 @@ def triangulate(
         triangles.append(fans.reshape(-1, 3))
         owners.append(which[convex].repeat(count - 2))
         if count > MAX_CORNERS and not convex.all():
-            raise NotSupported(f"A polygon with notches has {count} corners; split it.")
+            raise NotSupported(f"A concave polygon has {count} corners, too many; split it.")
         for owner, polygon in zip(which[~convex], polygons[~convex], strict=True):
             cut = polygon[_ears(vertices[polygon])]
             triangles.append(cut)

@@ -98,9 +98,9 @@ def scaled_cameras(calibration: Calibration, shape: tuple[int, int]) -> Float[np
     height, width = calibration.shape or shape
     if not (height > 0 and width > 0 and same_aspect((height, width), shape)):
         raise SequenceError(
-            f"{calibration.source} is of images of {size((height, width))} pixels, and the depth "
-            f"images are {size(shape)}; expected the camera of the depth images: write theirs to "
-            "cam_K.txt, and remove it."
+            f"{calibration.source} is of images of {size((height, width))} pixels, but the depth "
+            f"images are {size(shape)}; expected the camera of the depth images: write its matrix "
+            "to cam_K.txt, and remove the other file."
         )
     scaled = _scaled(calibration.matrices, (height, width), shape)
     return np.stack([_checked(K, calibration.source, shape) for K in scaled])
@@ -193,8 +193,8 @@ def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
     height, width = shape_of(height, width, path)
     if not same_aspect((height, width), shape):
         raise SequenceError(
-            f"{path} is of images of {width} x {height}, and the depth images are {size(shape)}; "
-            "expected the camera of the depth images: write theirs."
+            f"{path} is of images of {width} x {height}, but the depth images are {size(shape)}; "
+            "expected the camera of the depth images: write that one."
         )
     K[:2, 2] += 0.5
     return _scaled(K, (height, width), shape)

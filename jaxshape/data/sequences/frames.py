@@ -323,9 +323,9 @@ def _mask_pixels(path: Picture, shape: tuple[int, int]) -> np.ndarray:
 def _check_aspect(image: Image.Image, shape: tuple[int, int], path: Picture) -> None:
     if not same_aspect((image.height, image.width), shape):
         raise SequenceError(
-            f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the depth images, or "
-            "that enlarged, so that both show the same: register it to the depth image, or remove "
-            "it."
+            f"{path} is {_size_of(image)} pixels; expected {size(shape)} like the depth images, "
+            "or another size of the same aspect ratio, so that both show the same: register it to "
+            "the depth image, or remove it."
         )
 
 

@@ -199,9 +199,12 @@ def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:
         if reading.by_columns and not reading.pairs:
             evidence = "the last column of the matrices is 0 0 0 1"
         else:
-            evidence = f"so {best.share:.0%} {compared}, as written {reading.given:.0%}"
+            evidence = f"then {best.share:.0%} {compared}, as written {reading.given:.0%}"
         if is_used:
-            advice = f"It is read so. {options} states it; --convention {AS_GIVEN} denies it."
+            advice = (
+                f"It is read in this convention. {options} confirms it; --convention {AS_GIVEN} "
+                "turns it off."
+            )
         elif rival is None:
             advice = f"Is {options} meant?"
         else:
@@ -210,8 +213,8 @@ def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:
     if reading.pairs and (best is None or best.share < BADLY):
         if reading.given < BADLY:
             yield Finding(
-                f"the poses fit the depth images badly: {reading.given:.0%} {compared}, in no "
-                "known convention many more",
+                f"the poses fit the depth images badly: {reading.given:.0%} {compared}, and "
+                "no known convention fits much better",
                 "Check the depth scale, the camera, and that the poses belong to the depth images.",
             )
 

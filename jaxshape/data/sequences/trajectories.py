@@ -99,8 +99,8 @@ def write_trajectory(
     suffix = path.suffix.lower()
     if suffix == ".json" and camera is None:
         raise ValueError(
-            f"{path} has no camera; Open3D's .json holds the camera of each pose: give it, or "
-            "write .log."
+            f"{path} has no camera; Open3D's .json holds the camera of each pose: give the "
+            "camera, or write a .log file."
         )
     if suffix == ".json" and camera is not None:
         text = _json_text(trajectory, camera)
@@ -116,7 +116,7 @@ def _read_tum(text: str) -> Trajectory:
     lines = words_of(text)
     for line, words in lines:
         if len(words) != 8:
-            euroc = "; in EuRoC's, keep the first eight columns and put w last"
+            euroc = "; of a EuRoC file, keep the first eight columns and put w last"
             hint = euroc if len(words) == 17 else ""
             raise ValueError(f"line {line} holds {len(words)} numbers, not 8{hint}")
     numbers = np.array([[number(w) for w in words] for _, words in lines], dtype=np.float64)

@@ -31,9 +31,10 @@ def unread(
     """
     if contents.others:
         yield Finding(
-            f"not read, as they are no regular files: {', '.join(sorted(contents.others)[:4])}",
-            "Links to nothing, pipes and devices are passed over; copy the files again, if they "
-            "belong to the recording.",
+            "not read, because they are not regular files: "
+            + ", ".join(sorted(contents.others)[:4]),
+            "Broken links, pipes and devices are skipped; copy the files again, if they belong to "
+            "the recording.",
         )
     named = " ".join(evidence for evidence, _ in earlier)
     unnamed = frozenset(name for name in contents.files if name not in named)

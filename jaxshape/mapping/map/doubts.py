@@ -126,7 +126,9 @@ def _empty(progress: Progress) -> tuple[str, ...]:
     ]
     if not names:
         return ()
-    return (f"No pixel was taken for the object in {_named(names)}; nothing of that is fused.",)
+    return (
+        f"No pixel was segmented as the object in {_named(names)}; these frames are not fused.",
+    )
 
 
 def _left_out(progress: Progress) -> tuple[str, ...]:
@@ -138,8 +140,8 @@ def _left_out(progress: Progress) -> tuple[str, ...]:
     if share < LEFT_OUT:
         return ()
     return (
-        f"{share:.0%} of what was taken for the object in the first frame lies outside of its box: "
-        "the object is larger than the prior's, or something else touches it.",
+        f"{share:.0%} of the points segmented as the object in the first frame lie outside its "
+        "box: the object is larger than the prior expects, or something else touches it.",
     )
 
 
@@ -168,8 +170,8 @@ def _of_faces(unseen: Unseen) -> tuple[str, ...]:
     if not unseen.faces:
         return ()
     return (
-        f"Where the object ends was not seen at its {joined(unseen.faces)}: what the prior expects "
-        "there decides its size. Film it from there too.",
+        f"The end of the object was not seen at its {joined(unseen.faces)}, so the prior decides "
+        "its size there. Film it from there too.",
     )
 
 
@@ -187,6 +189,6 @@ def _of_legs(unseen: Unseen, height: float) -> tuple[str, ...]:
     if unseen.below < LEGS:
         return ()
     return (
-        f"Nothing was measured of its lowest {100 * unseen.below * height:.0f} cm: legs, or what "
-        "else is there, are predicted.",
+        f"Nothing was measured in the lowest {100 * unseen.below * height:.0f} cm of the object: "
+        "this part, for example its legs, is predicted.",
     )

@@ -113,10 +113,12 @@ def place_cloud(
         raise ValueError("The cloud cannot be placed: too few of its points are finite.")
     others = [float(found[one].misfit) for one in found if one != best]
     if min(others, default=np.inf) - float(found[best].misfit) < SURE_OF_UP:
-        warnings.append(f"Up is not sure: {best} is taken; say it with --up.")
+        warnings.append(f"The up direction is not sure: {best} is used; state it with --up.")
     # The front is judged here, since the search that follows keeps to it.
     if front is None and float(found[best].margin) < SURE_OF_FRONT:
-        warnings.append("The front is not sure: the object is symmetric; say it with --front.")
+        warnings.append(
+            "The front is not sure, because the object is symmetric; state it with --front."
+        )
     final = _placed(cloud, prior, _level(best, front) * metres, config, seed, found[best])
     T = np.asarray(final.T_world_object.as_matrix(), np.float64)
     T[:3] = _level(best, front).T @ T[:3]

@@ -231,8 +231,8 @@ def _place_first(
     start = _placed(start, prior, [seen])
     if start.placement is None:
         raise SequenceError(
-            f"{frame.name}: the object was cut out, but too little of it to place it; give another "
-            "--first frame, --click elsewhere, or its --box."
+            f"{frame.name}: the object was segmented, but too little of it was seen to find its "
+            "box; give another --first frame, --click elsewhere, or its --box."
         )
     return _with_doubt_of_front(start)
 
@@ -241,7 +241,10 @@ def _with_doubt_of_front(start: Start) -> Start:
     assert start.placement is not None
     if start.placement.margin >= SURE_OF_FRONT:
         return start
-    doubt = "Its front is not sure: it is symmetric, or was first seen from where that is hidden."
+    doubt = (
+        "The front of the object is not sure: the object is symmetric, or the first frame does not "
+        "show its front."
+    )
     return start._replace(notes=(*start.notes, doubt), warnings=(*start.warnings, doubt))
 
 
@@ -269,7 +272,7 @@ def _up(
     """
     R_world_camera = T_world_camera[:3, :3]
     if vertical is not None and (floor is None or floor.confidence < SURE):
-        return R_world_camera @ vertical, "No floor is sure; up is the direction of the walls."
+        return R_world_camera @ vertical, "No floor is sure; the walls give the up direction."
     if floor is not None:
         up = R_world_camera @ np.asarray(floor.plane.normal, np.float64)
         return up, f"Up is the normal of the floor ({floor.confidence:.0%} sure)."
@@ -283,7 +286,7 @@ def _up(
                 f"No floor is seen; the world's {sign}{name} is taken as up, the axis nearest to "
                 "the image's."
             )
-    return of_camera, "No floor is seen; the camera of the first frame is taken as held level."
+    return of_camera, "No floor is seen; the camera of the first frame is assumed to be level."
 
 
 def _nearest_axis(up: Float[np.ndarray, " 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -383,7 +386,7 @@ def _standing_on(start: Start, floor: Plane) -> Start:
     height = -floor.offset  # of the floor, along its normal, from the origin
     lower, upper = -box.size / 2, box.size / 2
     lower[1] = height - T_level_object[1, 3]
-    said = "Up and the floor are those of a later keyframe, the first that shows them well."
+    said = "Up and the floor come from a later keyframe, the first one that shows them well."
     kept = tuple(one for one in start.warnings if one not in start.notes[:2])
     start = start._replace(
         T_level_world=T_level_world,

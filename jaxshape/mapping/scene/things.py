@@ -109,11 +109,13 @@ def _matched(
 
 def _appeared(number: int, shared: Int[np.ndarray, " thing"], before: Tracks, size: int) -> str:
     if len(shared) and shared.max() > SAME * size:
-        return f"Object {number} parted from object {before.things[int(shared.argmax())].number}."
+        return (
+            f"Object {number} was split from object {before.things[int(shared.argmax())].number}."
+        )
     return f"Object {number} appeared."
 
 
 def _vanished(one: Thing, shared: Int[np.ndarray, " cluster"], number_of: dict[int, int]) -> str:
     if len(shared) and shared.max() > SWALLOWED * len(one.keys):
         return f"Object {one.number} is a part of object {number_of[int(shared.argmax())]}."
-    return f"Object {one.number} was not there: later frames see through it."
+    return f"Object {one.number} does not exist: later frames see through it."

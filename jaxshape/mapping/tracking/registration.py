@@ -124,7 +124,7 @@ def doubt(
         return f"only {float(alignment.inlier_fraction):.0%} of what is seen again agrees"
     has_jumped = distance > config.max_distance or angle > config.max_angle
     if T_expected is not None and has_jumped:
-        return f"it jumped by {distance:.2f} m and {angle:.0f} degrees"
+        return f"the camera jumped by {distance:.2f} m and {angle:.0f} degrees"
     return None
 
 

@@ -123,14 +123,14 @@ def _optimizer(name: str, config: RefineConfig) -> optax.GradientTransformation:
     """The optimiser of that name, with the learning rate of the settings or a good one."""
     if name in UNUSABLE:
         raise ValueError(
-            f"gradient:{name} is no method: {UNUSABLE[name]}. Build your own search from it with"
+            f"gradient:{name} cannot be used: {UNUSABLE[name]}. Build your own search from it with"
             " jaxshape.gradient."
         )
     factory = optimizers().get(name)
     if factory is None:
         raise ValueError(
-            f"optax has no optimiser {name!r} that needs a learning rate at most; adam, lbfgs and"
-            " rmsprop are some that it has."
+            f"optax has no optimiser {name!r} that needs only a learning rate; choose, for"
+            " example, adam, lbfgs or rmsprop."
         )
     rate = config.step_size
     if rate is None:

@@ -131,7 +131,7 @@ def test_pipes_devices_and_links_to_nothing_are_passed_over_and_named(tmp_path):
     assert len(sequence) == 4 and sequence.has_poses
     with pytest.raises(SequenceError, match="depth_2.png.*not a regular file"):
         sequence[2]
-    (finding,) = [one for one in sequence.findings if "no regular files" in one.evidence]
+    (finding,) = [one for one in sequence.findings if "not regular files" in one.evidence]
     assert "camera.json, circle.json, poses.log, trajectory.json" in finding.evidence
 
 

@@ -65,7 +65,7 @@ def test_each_convention_is_found_named_and_undone(tmp_path, name):
     found = inspect_sequence(write(tmp_path, *WRITTEN[name]))
     (warning,) = found.warnings
     stated = f"--convention {name}" if not name.startswith("--") else name
-    assert f"It is read so. {stated} states it" in warning.advice, warning
+    assert f"It is read in this convention. {stated} confirms it" in warning.advice, warning
     assert "so 9" in warning.evidence and found.poses.is_used and found.poses.agreement > 0.95
     for i, frame in enumerate(found.sequence):
         np.testing.assert_allclose(frame.T_world_camera, T[i], atol=1e-6)
@@ -120,7 +120,7 @@ def test_matrices_by_columns_of_object_to_camera_and_of_a_log(tmp_path):
     (tmp_path / "b.log").rename(tmp_path / "b/trajectory.log")
     for folder in ("a", "b"):
         found = inspect_sequence(open_sequence(tmp_path / folder))
-        assert "--convention transposed states it" in found.warnings[0].advice
+        assert "--convention transposed confirms it" in found.warnings[0].advice
         for i, frame in enumerate(found.sequence):
             np.testing.assert_allclose(frame.T_world_camera, T[i], atol=1e-6)
 

@@ -140,7 +140,7 @@ def test_damaged_trajectories(tmp_path, name, text, said):
 
 def test_json_needs_a_camera_and_a_failure_leaves_the_old_file(tmp_path):
     (tmp_path / "way.json").write_text("old")
-    with pytest.raises(ValueError, match="give it, or write .log"):
+    with pytest.raises(ValueError, match="give the camera, or write a .log file"):
         write_trajectory(tmp_path / "way.json", some_way(0, 2))
     assert (tmp_path / "way.json").read_text() == "old"
     with pytest.raises(SequenceError, match="nowhere"):

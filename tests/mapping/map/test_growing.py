@@ -107,7 +107,7 @@ def test_what_was_not_seen_is_said(recorded):
     assert "was not seen at its" in said and "bottom" in said and "back" in said
     _, steps = recorded([FAR[0], *FAR, AWAY])
     said = " ".join(doubts_of(steps[-1]))
-    assert "No pixel was taken for the object in frame-000005" in said
+    assert "No pixel was segmented as the object in frame-000005" in said
     assert "lowest" not in said and "top" not in said
 
 
@@ -120,5 +120,5 @@ def test_what_the_box_leaves_out_of_the_first_frame_is_said(recorded):
     upper = first.segmented & (rows < jnp.median(jnp.nonzero(first.segmented)[0]))
     cut = last.state._replace(keyframes=(first._replace(segmented=upper), *others))
     said = " ".join(doubts_of(last._replace(state=cut)))
-    share = int(said.split("% of what was taken for the object in the first frame")[0][-2:])
+    share = int(said.split("% of the points segmented as the object in the first frame")[0][-2:])
     assert 40 < share < 65

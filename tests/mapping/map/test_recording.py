@@ -310,8 +310,8 @@ def test_a_box_that_is_not_sure_is_said_and_none_is_refused(begin, folder, monke
 
     monkeypatch.setattr(finding, "_place", symmetric)
     _, start = begin(folder, box=False)
-    assert any("front is not sure" in warning for warning in start.warnings)
+    assert any("front of the object is not sure" in warning for warning in start.warnings)
 
     monkeypatch.setattr(finding, "_place", lambda prior, seen, floor, known, config: known)
-    with pytest.raises(SequenceError, match="too little of it to place it"):
+    with pytest.raises(SequenceError, match="too little of it was seen to find its box"):
         begin(folder, box=False)

@@ -31,10 +31,10 @@ def test_without_poses_or_axes_nearby_the_camera_is_taken_as_level():
     T[:3, :3] = Rotation.from_rotvec([0.0, 0, 0.6]).as_matrix()
     found, said = _up(None, None, T, False)
     np.testing.assert_allclose(found, -T[:3, 1])
-    assert "held level" in said
+    assert "assumed to be level" in said
     oblique, _ = Rotation.align_vectors([[1, 1, 1]], [[0, -1, 0]])
     T[:3, :3] = oblique.as_matrix()
-    assert "held level" in _up(None, None, T, True)[1]
+    assert "assumed to be level" in _up(None, None, T, True)[1]
 
 
 @pytest.mark.parametrize("confidence", [None, 0.0, 0.3, 0.9])
@@ -48,4 +48,4 @@ def test_walls_count_more_than_a_level_surface_that_may_be_a_table_top(confidenc
     of_walls = confidence is None or confidence < 0.5
     expected = [0, 1, 0] if of_walls else T[:3, :3] @ plane.normal
     np.testing.assert_allclose(found, expected, atol=1e-9)
-    assert ("direction of the walls" in said) == of_walls
+    assert ("walls give the up direction" in said) == of_walls

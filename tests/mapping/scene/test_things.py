@@ -47,7 +47,7 @@ def test_of_two_that_join_the_larger_one_stays():
 def test_of_one_that_parts_the_larger_part_stays():
     parted = tracks_after([block(0, 20)], [block(14, 6), block(0, 12)])
     assert numbers(parted) == {0: 1, 14: 2}
-    assert parted.events[-1] == "Object 2 parted from object 1."
+    assert parted.events[-1] == "Object 2 was split from object 1."
 
 
 def test_numbers_are_never_given_twice():

@@ -170,11 +170,11 @@ GOOD = Alignment(
         ({"inlier_fraction": jnp.float32(0.4)}, "only 40% of what is seen again agrees"),
         (
             {"T_reference_source": jaxlie.SE3.from_translation(jnp.array([0.6, 0, 0]))},
-            "it jumped by 0.60 m and 0 degrees",
+            "the camera jumped by 0.60 m and 0 degrees",
         ),
         (
             {"T_reference_source": jaxlie.SE3.from_rotation(jaxlie.SO3.from_y_radians(1.0))},
-            "it jumped by 0.00 m and 57 degrees",
+            "the camera jumped by 0.00 m and 57 degrees",
         ),
     ],
 )

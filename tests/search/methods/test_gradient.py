@@ -176,7 +176,7 @@ def test_names_of_no_optimiser_say_so(name):
 def test_optimisers_that_no_name_stands_for_are_refused_with_the_reason(name):
     assert name in vars(optax) | vars(optax.contrib)
     with pytest.raises(
-        ValueError, match=f"gradient:{name} is no method: it (clips|changes|estimates) .*"
+        ValueError, match=f"gradient:{name} cannot be used: it (clips|changes|estimates) .*"
     ):
         build(name, 3, RefineConfig())
 

@@ -118,7 +118,7 @@ def _instance(truth: dict[str, Any]) -> tuple[Instance | None, tuple[Finding, ..
         Finding(
             f"the scene holds {len(shown)} objects; masks and object poses belong to object "
             f"{chosen[0]}, which most images show",
-            "For another one, take away the folders mask_visib and mask, and --click it.",
+            "For another object, remove the folders mask_visib and mask, and --click it.",
         ),
     )
 

@@ -125,7 +125,7 @@ def _lone_colors(offered: int, found: list[Path | None]) -> tuple[Finding, ...]:
     return (
         Finding(
             f"{len(found) - used} of {len(found)} depth images have no colour image of the same "
-            f"name or number, of {offered} there are",
+            f"name or number, although there are {offered} colour images",
             "Give both the same names, if they were taken together.",
         ),
     )
@@ -165,7 +165,7 @@ def _trajectory_poses(contents: Contents, count: int) -> PoseReader | None:
             raise SequenceError(
                 f"{path} has poses of frames up to {frames.max()}, and there are {count} depth "
                 "images; expected the number of a depth image, from 0, before each pose: write "
-                "theirs."
+                "these numbers."
             )
         frames = np.arange(count)
     poses = dict(zip(frames.tolist(), trajectory.T_world_camera, strict=True))

@@ -182,7 +182,7 @@ def _distorted(about: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Fin
         return ()
     return (
         Finding(
-            f"the images are bent by their lens ({lens}), and are taken as straight",
-            "Undistort colour and depth images first, if surfaces come out bent.",
+            f"the images have lens distortion ({lens}), which is ignored",
+            "Undistort colour and depth images first, if the reconstructed surfaces are bent.",
         ),
     )

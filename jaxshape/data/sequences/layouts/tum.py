@@ -89,8 +89,8 @@ def check_rising(times: Float[np.ndarray, " n"], path: Path) -> None:
         first = times[still[0]], times[still[0] + 1]
         raise SequenceError(
             f"{path} has {len(still)} times that do not rise, {first[0]:g} and then {first[1]:g} "
-            "among them; expected seconds from one start in the order of the film, not intervals: "
-            "write their sums."
+            "among them; expected increasing seconds since one start, not intervals between "
+            "frames: write their sums."
         )
 
 
