@@ -158,9 +158,9 @@ def test_a_good_result_has_no_reasons():
         (
             {"unseen_faces": ("left side", "right side", "bottom", "back", "front")},
             "failed",
-            "at none of its sides",
+            "was not seen at any side",
         ),
-        ({"unseen_below": 0.3}, "doubtful", "its lower 30%, legs"),
+        ({"unseen_below": 0.3}, "doubtful", "its lower 30%, for example the legs"),
         ({"unseen_below": 0.6}, "failed", "nothing was measured in its lower 60%"),
         ({"size": (0.5, 9.0, 0.5)}, "failed", "would be 9 m large"),
         ({"size": (0.01, 0.01, 0.02)}, "failed", "would be 0.02 m large"),

@@ -66,7 +66,7 @@ def test_each_convention_is_found_named_and_undone(tmp_path, name):
     (warning,) = found.warnings
     stated = f"--convention {name}" if not name.startswith("--") else name
     assert f"It is read in this convention. {stated} confirms it" in warning.advice, warning
-    assert "so 9" in warning.evidence and found.poses.is_used and found.poses.agreement > 0.95
+    assert "then 9" in warning.evidence and found.poses.is_used and found.poses.agreement > 0.95
     for i, frame in enumerate(found.sequence):
         np.testing.assert_allclose(frame.T_world_camera, T[i], atol=1e-6)
         np.testing.assert_allclose(frame.depth, SEEN.depth[i], atol=1e-3)
