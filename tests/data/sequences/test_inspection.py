@@ -42,7 +42,7 @@ def test_poses_tell_a_wrong_depth_scale(tmp_path, written, read):
     write_7_scenes(tmp_path, SEEN, scale=written)
     sequence = open_sequence(tmp_path, depth_scale=read)
     (warning,) = inspect_sequence(sequence, keep_scale=True).warnings
-    said = rf"a metre has {written} depth units: so 9\d% .* as written \d+%"
+    said = rf"a metre has {written} depth units: then 9\d% .* as written \d+%"
     assert re.search(said, warning.evidence)
     assert warning.advice == f"Is --depth-scale {written} meant?"
     assert inspect_sequence(sequence).sequence.depth_scale == written
