@@ -28,7 +28,7 @@ from jaxshape.mapping.segmentation.planes import camera_points
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.process import prepare_process
-from rebuilding import judgement, middle_pixel, rebuilt, usual
+from rebuilding import judgement, meshed, middle_pixel, rebuilt, usual
 from runs import earlier
 
 RESULTS = Path(__file__).parent / "results"
@@ -114,7 +114,7 @@ def _rebuild(
     try:
         start = find_start(sequence, placer, prompt, first=chosen.start, use_pose=way != "none")
         progress = rebuilt(sequence, start, placer, mapper, use_poses=way == "given", chosen=chosen)
-        result = judgement(progress)
+        result = judgement(progress, meshed(progress))
     except SequenceError as failure:
         return {"failed": str(failure)}
     off = np.array(result["size"]) - box.size

@@ -35,7 +35,7 @@ from jaxshape.mapping.placement.finding import find_start
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.process import prepare_process
-from rebuilding import judgement, middle_pixel, rebuilt, usual
+from rebuilding import judgement, meshed, middle_pixel, rebuilt, usual
 from runs import earlier, spread
 
 RESULTS = Path(__file__).parent / "results"
@@ -135,7 +135,7 @@ def _rebuilt(
     return {
         "sides": sides_of(progress.start.box, seen).round(4).tolist(),
         "true_size": seen.size.round(4).tolist(),
-        **judgement(progress),
+        **judgement(progress, meshed(progress)),
         "cpu_seconds": round(time.process_time() - began, 1),
     }
 

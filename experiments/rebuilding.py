@@ -12,7 +12,7 @@ from jaxshape.mapping.map.recording import Progress, follow
 from jaxshape.mapping.placement.finding import Start
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
-from jaxshape.results.output import only, shape_mesh
+from jaxshape.results.output import ShapeMesh, only, shape_mesh
 from jaxshape.results.progress import floor_height, observation_of, seen_views
 from jaxshape.results.verdict import judged, quality_of
 from jaxshape.search.config import RefineConfig
@@ -46,17 +46,22 @@ def rebuilt(
     return progress._replace(state=state, shape=shape)
 
 
-def judgement(progress: Progress) -> dict[str, Any]:
+def meshed(progress: Progress) -> ShapeMesh:
+    """The mesh of a finished map."""
+    assert progress.shape is not None
+    one = only(progress.shape)
+    return shape_mesh(observation_of(progress.state), one.composed, one.fill_logits)
+
+
+def judgement(progress: Progress, found: ShapeMesh) -> dict[str, Any]:
     """The judgement of a result: size, warnings, verdict, reasons, figures of quality."""
     assert progress.shape is not None
-    observation, one = observation_of(progress.state), only(progress.shape)
-    found = shape_mesh(observation, one.composed, one.fill_logits)
     quality = quality_of(
         found.mesh,
         found.measured,
         seen_views(progress.state),
-        axial=observation.sensor.axial,
-        is_mirrored=bool(one.symmetric),
+        axial=observation_of(progress.state).sensor.axial,
+        is_mirrored=bool(only(progress.shape).symmetric),
         floor=floor_height(progress.start),
         unseen=unseen_of(progress),
     )
