@@ -260,7 +260,7 @@ def papers_step(journal: Journal, config: Config) -> Claim:
     method, trial = DESCENT, PAPERS[DESCENT]
     best = best_in(journal, config, method, "raw")
     longest = max(one.step for one in TRIALS[method] if one.space == "raw")
-    edge = ", the longest tried" if best.step == longest else ""
+    edge = ", the longest tried," if best.step == longest else ""
     raw = [i for i, one in enumerate(TRIALS[method]) if one.space == "raw"]
     ending_above = np.max([overshoots(journal, k, method) for k in config.frames], axis=0)
     too_long = [TRIALS[method][i].step for i in raw if ending_above[i] > 0.1]
@@ -270,9 +270,10 @@ def papers_step(journal: Journal, config: Config) -> Claim:
     return Claim(
         "Fig. gm right",
         "A step of 0.14 leads to fast convergence without overshooting",
-        f"{percents(journal, config, method, trial)} of the best fall at {_listed(config.frames)}"
-        f" frames in {config.iterations} iterations; {text(best)}{edge} is best. Steps that leave"
-        f" a tenth of the chairs above the start: {_listed(too_long) or 'none'}",
+        f"It achieves {percents(journal, config, method, trial)} of the best step's decrease at"
+        f" {_listed(config.frames)} frames in {config.iterations} iterations; {text(best)}{edge} is"
+        " the best step. Steps after which a tenth of the chairs end above the start:"
+        f" {_listed(too_long) or 'none'}",
         "yes" if is_fast and is_kept else "not fast" if is_kept else "no",
     )
 
@@ -283,9 +284,10 @@ def papers_sigma(journal: Journal, config: Config) -> Claim:
     return Claim(
         "Sec. 4",
         "sigma0 = 2 is best for CMA-ES",
-        f"{percents(journal, config, method, trial)} of the fall of the best sigma0 at"
-        f" {_listed(config.frames)} frames: 2 is {trial.step / deviation:.1f} deviations of"
-        f" the codes; best in the same space is {text(best_in(journal, config, method, 'raw'))}",
+        f"It achieves {percents(journal, config, method, trial)} of the best sigma0's decrease at"
+        f" {_listed(config.frames)} frames: 2 is {trial.step / deviation:.1f} standard deviations"
+        " of the codes. The best value in this space is"
+        f" {text(best_in(journal, config, method, 'raw'))}",
         "yes" if min(parts(journal, config, method, trial)) > 0.9 else "no",
     )
 
@@ -298,9 +300,9 @@ def papers_scales(journal: Journal, config: Config) -> Claim:
     return Claim(
         "beyond",
         "The paper's two values follow from the scale of its codes and of its loss",
-        f"2 would be the best sigma0 for codes {longer:.0f} times as long; 0.14 were then the best"
-        f" step for a loss {louder:.1g} times as large (that without the 1 / N^3 is 3e+04 times as"
-        " large)",
+        f"2 would be the best sigma0 for codes {longer:.0f} times as long. For such codes, 0.14"
+        f" would be the best step for a loss {louder:.1g} times as large; the loss without the"
+        " factor 1 / N^3 is 3e+04 times as large",
         "plausible" if 0.1 < louder / RESOLUTION**3 < 10 else "not from these two alone",
     )
 
@@ -309,10 +311,10 @@ def steady(journal: Journal, config: Config) -> Claim:
     best = {method: best_of(journal, config, method) for method in TRIALS}
     return Claim(
         "beyond",
-        f"One value does for {_listed(config.frames)} frames",
+        f"One value suffices for {_listed(config.frames)} frames",
         "; ".join(
             f"{method} {text(best[method]['all'])}:"
-            f" {percents(journal, config, method, best[method]['all'])} of the best falls"
+            f" {percents(journal, config, method, best[method]['all'])} of the best decreases"
             for method in TRIALS
         ),
         _which({m: min(parts(journal, config, m, best[m]["all"])) > 0.9 for m in TRIALS}),
@@ -330,8 +332,8 @@ def defaults(journal: Journal, config: Config) -> Claim:
         ]
         return (
             f"{method}, {text(DEFAULTS[method])}:"
-            f" {percents(journal, config, method, DEFAULTS[method])} of the best falls, IoU"
-            f" {mean_interval(np.concatenate(differences))} against the best"
+            f" {percents(journal, config, method, DEFAULTS[method])} of the best decreases,"
+            f" IoU {mean_interval(np.concatenate(differences))} relative to the best value"
         )
 
     return Claim(
@@ -353,7 +355,7 @@ def spaces(journal: Journal, config: Config) -> Claim:
         "; ".join(
             f"{method}: "
             + ", ".join(f"{text(t)} {percents(journal, config, method, t)}" for t in best[method])
-            + " of the best falls"
+            + " of the best decreases"
             for method in PAPERS
         ),
         _which({m: min(parts(journal, config, m, best[m][0])) > 0.9 for m in PAPERS}),
@@ -366,7 +368,9 @@ def _listed(values: Sequence[Any]) -> str:
 
 def _which(holds: dict[str, bool]) -> str:
     names = [name for name, does in holds.items() if does]
-    return "yes" if len(names) == len(holds) else f"of {' and '.join(names)}" if names else "no"
+    return (
+        "yes" if len(names) == len(holds) else f"for {' and '.join(names)} only" if names else "no"
+    )
 
 
 def plot(journal: Journal, config: Config) -> None:
