@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
 
+from jaxshape.data.rays import has_embree, rasterize
 from jaxshape.data.virtual_cameras import CAMERAS, SensorNoise, VirtualCamera
 from jaxshape.geometry.camera import Intrinsics
 
@@ -94,7 +95,13 @@ def render_depth(
     for i, pose in enumerate(poses):  # one view at a time stays in the processor's cache
         pixel, origin = np.flatnonzero(may_hit[i]), pose[:3, 3]
         directions = rays[pixel] @ pose[:3, :3].T
-        triangle = mesh.ray.intersects_first(np.broadcast_to(origin, directions.shape), directions)
+        if has_embree():
+            origins = np.broadcast_to(origin, directions.shape)
+            triangle = mesh.ray.intersects_first(origins, directions)
+        else:
+            seen = (mesh.triangles - origin) @ pose[:3, :3]
+            x, y = rays[: size[1], 0], rays[:: size[1], 1]
+            triangle = rasterize(seen, seen[..., 2], x, y).ravel()[pixel]
         hit = np.flatnonzero(triangle >= 0)
         pixel, triangle, directions = pixel[hit], triangle[hit], directions[hit]
         facing = _dot(normals[triangle], directions)

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Integer, UInt8
 
+from jaxshape.data.rays import has_embree, rasterize
 from jaxshape.report.palette import COLORS
 
 AZIMUTH, ELEVATION = 35.0, 25.0
@@ -186,11 +187,10 @@ def render_mesh(
     azimuth: float = AZIMUTH,
     elevation: float = ELEVATION,
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """Draw a mesh, smoothly shaded and scaled to fill the picture, by casting a ray per pixel.
+    """Draw a mesh, smoothly shaded and scaled to fill the picture.
 
     `color` is one colour as `#rrggbb`, or one for each vertex. A mesh without faces gives a white
     picture.
-    Fast where `embreex` is installed.
     """
     pixels = size * _SUPERSAMPLING
     canvas = np.ones((pixels, pixels, 3))
@@ -201,31 +201,53 @@ def render_mesh(
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = _MARGIN * (high - low)[:2].max() / pixels
     across = (np.arange(pixels) + 0.5 - pixels / 2) * step
-    center = (low + high) / 2
-    for first in range(0, pixels, _ROWS):  # rays of the whole picture take hundreds of megabytes
+    x, y = (low + high)[0] / 2 + across, (low + high)[1] / 2 - across
+    far = high[2] + step  # the plane of the viewer
+    for first in range(0, pixels, _ROWS):  # a whole picture at once takes hundreds of megabytes
         rows = slice(first, first + _ROWS)
-        y, x = np.meshgrid(-across[rows], across, indexing="ij")
-        away = np.full_like(x, high[2] + step)
-        origins = np.stack([center[0] + x, center[1] + y, away], axis=-1)
-        seen, shades = _seen(mesh, origins.reshape(-1, 3) @ view, view, color)
-        canvas[rows].reshape(-1, 3)[seen] = shades
+        faces = _first_faces(mesh, vertices, view, x, y[rows], far)
+        row, column = np.nonzero(faces >= 0)
+        faces = faces[row, column]
+        points = np.stack([x[column], y[rows][row]], axis=1)
+        canvas[rows][row, column] = _shades(mesh, vertices, faces, points, view, color)
     return _to_image(canvas)
 
 
-def _seen(
+def _first_faces(
     mesh: trimesh.Trimesh,
-    origins: Float[np.ndarray, "n 3"],
+    vertices: Float[np.ndarray, "n 3"],
+    view: Float[np.ndarray, "3 3"],
+    x: Float[np.ndarray, " w"],
+    y: Float[np.ndarray, " h"],
+    far: float,
+) -> Integer[np.ndarray, "h w"]:
+    """The face that each pixel shows, of those that face it from the plane `far`; -1 for none."""
+    if not has_embree():
+        corners = vertices[mesh.faces]
+        flat = corners * [1, 1, 0] + [0, 0, 1]
+        return rasterize(flat, far - corners[..., 2], x, y[::-1])[::-1]
+    across, down = np.meshgrid(x, y)
+    origins = np.stack([across, down, np.full_like(across, far)], axis=-1).reshape(-1, 3) @ view
+    directions = np.broadcast_to(-view[2], origins.shape)
+    return mesh.ray.intersects_first(origins, directions).reshape(across.shape)
+
+
+def _shades(
+    mesh: trimesh.Trimesh,
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Integer[np.ndarray, " m"],
+    points: Float[np.ndarray, "m 2"],
     view: Float[np.ndarray, "3 3"],
     color: str | UInt8[np.ndarray, "v 3"],
-) -> tuple[Integer[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
-    """Rays away from the viewer that meet the mesh, and the shaded colour that each sees."""
-    directions = np.broadcast_to(-view[2], origins.shape)
-    hits, rays, faces = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
-    corners = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], hits)
+) -> Float[np.ndarray, "m 3"]:
+    """The shaded colours of faces at points of the picture, given as right and up."""
+    flat = vertices[mesh.faces[faces]] * [1, 1, 0]
+    flat_points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+    corners = trimesh.triangles.points_to_barycentric(flat, flat_points)
     normals = np.einsum("nk,nkd->nd", corners, mesh.vertex_normals[mesh.faces[faces]]) @ view.T
     normals *= np.where(normals[:, 2:] < 0, -1, 1)  # open surfaces are seen from either side
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     paint = rgb(color) if isinstance(color, str) else np.einsum(
         "nk,nkd->nd", corners, color[mesh.faces[faces]] / 255
     )  # fmt: skip
-    return rays, paint * _brightness(normals)[:, None]
+    return paint * _brightness(normals)[:, None]

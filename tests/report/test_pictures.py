@@ -6,6 +6,8 @@ import pytest
 import trimesh
 from pixels import drawn, grid_of
 
+from jaxshape import random_chair
+from jaxshape.report import pictures
 from jaxshape.report.pictures import render_mesh, render_voxels
 
 
@@ -129,6 +131,15 @@ def test_an_inside_out_mesh_looks_the_same():
     inverted.invert()
     images = [render_mesh(m, size=48).astype(int) for m in (ball, inverted)]
     assert np.abs(images[0] - images[1]).max() <= 1
+
+
+def test_without_embree_a_mesh_looks_the_same(monkeypatch):
+    chair = random_chair(7)
+    shades = np.random.default_rng(0).integers(0, 255, (len(chair.vertices), 3)).astype(np.uint8)
+    image = render_mesh(chair, color=shades, size=64).astype(int)
+    monkeypatch.setattr(pictures, "has_embree", lambda: False)
+    other = render_mesh(chair, color=shades, size=64)
+    assert (np.abs(image - other).max(axis=2) > 8).mean() < 0.005  # rays that graze an edge
 
 
 def test_a_mesh_without_faces_is_white():
