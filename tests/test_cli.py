@@ -461,6 +461,7 @@ def test_demo_compares_with_the_truth_and_repeats_itself(run, tmp_path, linear):
     assert 0 < results[0]["mesh_measured"] < 1 and 0 < results[0]["symmetry_agreement"] <= 1
 
 
+@pytest.mark.slow
 def test_demo_of_a_table_as_in_the_paper(run, tmp_path, linear):
     """Clean square images, points in voxels, nothing mirrored."""
     few = ("--frames", 2, "--method", "encoder")

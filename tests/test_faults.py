@@ -264,7 +264,8 @@ cli.main()
 """
 
 
-@pytest.mark.parametrize("poses", ["given", pytest.param("first", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("poses", ["given", "first"])
 def test_a_process_is_killed(run, folder, tmp_path, known_weights, poses):
     """What the same command, given again, ends with is what it ends with undisturbed."""
     given = (folder, "--box", folder / "box.json", "--poses", poses)

@@ -62,6 +62,7 @@ def test_an_example_is_short_and_uses_public_names(name):
     assert f"python docs/examples/{name}" in (ast.get_docstring(ast.parse(text)) or "")
 
 
+@pytest.mark.slow
 def test_the_decoder_fits_chairs_that_it_never_saw(answer):
     first, last = answer("own_decoder.py")
     assert 0 < first < last - 0.03
@@ -72,6 +73,7 @@ def quick(weights: Path) -> dict[str, str]:
     return {"js.load_prior()": f"js.load_prior({str(weights)!r})"}
 
 
+@pytest.mark.slow
 def test_outlines_reach_the_search(answer, linear_weights):
     """With a prior that compiles at once, and knows no chairs: the shapes differ."""
     alone, outlined = answer("own_residual.py", quick(linear_weights) | {":.2f": ":.5f"})

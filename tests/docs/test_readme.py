@@ -147,7 +147,14 @@ def place(tmp_path, walk, known_weights, monkeypatch):
     return place
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+LONG = ("docs/recordings.md", "docs/scenes.md", "docs/searches.md", "docs/uncertainty.md")
+"""Documents whose code rebuilds or compiles much: it runs with -m slow."""
+
+
+@pytest.mark.parametrize(
+    "document",
+    [pytest.param(one, marks=[pytest.mark.slow] * (one in LONG)) for one in DOCUMENTS],
+)
 def test_code_runs(document, place, unchecked_types):
     """The blocks of a document one after another: later ones use the names of earlier ones."""
     names: dict = {}
@@ -169,18 +176,15 @@ def run_all(run, lines: list[str]) -> None:
         assert status == 0, f"{line}\n{err}"
 
 
-SLOW = (
-    "jaxshape complete",
-    "jaxshape dataset",
-    "jaxshape train",
-    "jaxshape reconstruct kitchen",
-    "--box box.json",
+SLOW = tuple(
+    f"jaxshape {name}"
+    for name in ("complete", "dataset", "demo", "evaluate", "reconstruct", "train")
 )
-"""What marks a command whose like is tested in tests/test_cli.py: these run with -m slow."""
+"""Commands that tests/test_cli.py and tests/test_complete.py run: those of documents are slow."""
 
 
 def is_slow(line: str) -> bool:
-    return any(mark in line for mark in SLOW)
+    return line.startswith(SLOW)
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

@@ -142,6 +142,7 @@ def test_an_empty_room_is_followed_to_its_end(tmp_path, classes):
     assert finish_scene(scene, classes).objects == () and len(scene.logs) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_poses", [True, False])
 def test_a_map_among_others_is_the_map_of_one_object_alone(sequence, priors, use_poses):
     """`follow`, of one object, against the same object beside another one."""
