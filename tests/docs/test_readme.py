@@ -178,7 +178,7 @@ def run_all(run, lines: list[str]) -> None:
 
 SLOW = tuple(
     f"jaxshape {name}"
-    for name in ("complete", "dataset", "demo", "evaluate", "reconstruct", "train")
+    for name in ("complete", "dataset", "demo", "evaluate", "plot", "reconstruct", "train")
 )
 """Commands that tests/test_cli.py and tests/test_complete.py run: those of documents are slow."""
 
