@@ -43,9 +43,9 @@ from jaxshape.mapping.tracking.keyframes import as_pose, prepare
 from jaxshape.mapping.tracking.registration import displacement
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.process import prepare_process
-from jaxshape.report.palette import COLORS
+from jaxshape.report.paint import by_source
 from jaxshape.report.panels import Panel, write_panels
-from jaxshape.report.pictures import render_mesh, rgb
+from jaxshape.report.pictures import render_mesh
 from jaxshape.results.output import ShapeMesh
 from rebuilding import judgement, meshed, rebuilt, usual
 
@@ -192,25 +192,20 @@ def _seconds(progress: Progress) -> dict[str, float]:
 
 def _from_all_sides(way: str, found: ShapeMesh) -> list[Panel]:
     """The mesh from three sides: its measured part blue, its predicted part orange."""
+    assert found.measured is not None
     return [
         Panel(
             f"{WAYS[way]}: {side}",
-            render_mesh(found.mesh, color=_by_source(found), azimuth=azimuth, size=400),
+            render_mesh(found.mesh, color=by_source(found.measured), azimuth=azimuth, size=400),
         )
         for side, azimuth in SIDES.items()
     ]
 
 
-def _by_source(found: ShapeMesh) -> np.ndarray:
-    assert found.measured is not None
-    blue, orange = (np.uint8(255 * rgb(COLORS[name])) for name in ("measured", "predicted"))
-    return np.where(found.measured[:, None], blue, orange)
-
-
 def _write_turn(found: ShapeMesh, path: Path) -> None:
     """An animation of two turns: of the measured part alone, then of the whole mesh."""
     assert found.measured is not None
-    mesh, colors = found.mesh, _by_source(found)
+    mesh, colors = found.mesh, by_source(found.measured)
     # Points of a circle around the mesh, without faces, keep the scale of all pictures the same.
     middle, radius = mesh.bounds.mean(axis=0), np.linalg.norm(mesh.extents[[0, 2]]) / 2
     angles = np.linspace(0, 2 * np.pi, 4 * TURN)

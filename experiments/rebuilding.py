@@ -60,7 +60,7 @@ def judgement(progress: Progress, found: ShapeMesh) -> dict[str, Any]:
         found.mesh,
         found.measured,
         seen_views(progress.state),
-        axial=observation_of(progress.state).sensor.axial,
+        axial=progress.state.fusing.sensor.axial,
         is_mirrored=bool(only(progress.shape).symmetric),
         floor=floor_height(progress.start),
         unseen=unseen_of(progress),

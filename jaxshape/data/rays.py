@@ -1,17 +1,10 @@
 """The first triangle on each ray of an image, without Embree. [host]"""
 
-from importlib.util import find_spec
-
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 PAIRS = 1_000_000
 """Pairs of a triangle and a pixel that the rasteriser tests together."""
-
-
-def has_embree() -> bool:
-    """Whether Embree casts rays here; it is not built for all machines."""
-    return find_spec("embreex") is not None
 
 
 def rasterize(

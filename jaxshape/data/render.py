@@ -9,8 +9,9 @@ import jaxlie
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
+from trimesh.ray import has_embree
 
-from jaxshape.data.rays import has_embree, rasterize
+from jaxshape.data.rays import rasterize
 from jaxshape.data.virtual_cameras import CAMERAS, SensorNoise, VirtualCamera
 from jaxshape.geometry.camera import Intrinsics
 
@@ -95,7 +96,7 @@ def render_depth(
     for i, pose in enumerate(poses):  # one view at a time stays in the processor's cache
         pixel, origin = np.flatnonzero(may_hit[i]), pose[:3, 3]
         directions = rays[pixel] @ pose[:3, :3].T
-        if has_embree():
+        if has_embree:
             origins = np.broadcast_to(origin, directions.shape)
             triangle = mesh.ray.intersects_first(origins, directions)
         else:

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from jaxshape.report.palette import COLORS
 from jaxshape.report.pictures import rgb
@@ -38,10 +38,19 @@ def paints(found: ResultFolder) -> dict[str, Paint]:
     if found.color is not None:
         there["color"] = Paint("colours of the frames", found.color)
     if found.measured is not None:
-        blue, orange = (np.uint8(255 * rgb(COLORS[name])) for name in ("measured", "predicted"))
-        by_source = np.where(found.measured[:, None], blue, orange)
-        there["source"] = Paint("measured (blue), predicted (orange)", by_source)
+        colors = by_source(found.measured)
+        there["source"] = Paint("measured (blue), predicted (orange)", colors)
     if found.confidence is not None:
         shades = (255 * colormaps["viridis"](found.confidence)[:, :3]).astype(np.uint8)
         there["confidence"] = Paint("how sure: 0 (violet) to 1 (yellow)", shades)
     return there
+
+
+def by_source(measured: Bool[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    """The colours of vertices: one for measured surface, one for predicted surface.
+
+    Args:
+        measured: Whether each vertex lies on the measured surface `[n]`.
+    """
+    blue, orange = (np.uint8(255 * rgb(COLORS[name])) for name in ("measured", "predicted"))
+    return np.where(measured[:, None], blue, orange)

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Integer, UInt8
+from trimesh.ray import has_embree
 
-from jaxshape.data.rays import has_embree, rasterize
+from jaxshape.data.rays import rasterize
 from jaxshape.report.palette import COLORS
 
 AZIMUTH, ELEVATION = 35.0, 25.0
@@ -203,14 +204,18 @@ def render_mesh(
     across = (np.arange(pixels) + 0.5 - pixels / 2) * step
     x, y = (low + high)[0] / 2 + across, (low + high)[1] / 2 - across
     far = high[2] + step  # the plane of the viewer
-    for first in range(0, pixels, _ROWS):  # a whole picture at once takes hundreds of megabytes
-        rows = slice(first, first + _ROWS)
-        faces = _first_faces(mesh, vertices, view, x, y[rows], far)
-        row, column = np.nonzero(faces >= 0)
-        faces = faces[row, column]
+    faces = _first_faces(mesh, vertices, view, x, y, far)
+    for rows in _bands(pixels):
+        row, column = np.nonzero(faces[rows] >= 0)
         points = np.stack([x[column], y[rows][row]], axis=1)
-        canvas[rows][row, column] = _shades(mesh, vertices, faces, points, view, color)
+        seen = faces[rows][row, column]
+        canvas[rows][row, column] = _shades(mesh, vertices, seen, points, view, color)
     return _to_image(canvas)
+
+
+def _bands(pixels: int) -> list[slice]:
+    """Rows that are drawn together: a whole picture at once takes hundreds of megabytes."""
+    return [slice(first, first + _ROWS) for first in range(0, pixels, _ROWS)]
 
 
 def _first_faces(
@@ -222,14 +227,17 @@ def _first_faces(
     far: float,
 ) -> Integer[np.ndarray, "h w"]:
     """The face that each pixel shows, of those that face it from the plane `far`; -1 for none."""
-    if not has_embree():
+    if not has_embree:
         corners = vertices[mesh.faces]
         flat = corners * [1, 1, 0] + [0, 0, 1]
         return rasterize(flat, far - corners[..., 2], x, y[::-1])[::-1]
-    across, down = np.meshgrid(x, y)
-    origins = np.stack([across, down, np.full_like(across, far)], axis=-1).reshape(-1, 3) @ view
-    directions = np.broadcast_to(-view[2], origins.shape)
-    return mesh.ray.intersects_first(origins, directions).reshape(across.shape)
+    faces = []
+    for rows in _bands(len(y)):
+        across, down = np.meshgrid(x, y[rows])
+        origins = np.stack([across, down, np.full_like(across, far)], axis=-1).reshape(-1, 3) @ view
+        directions = np.broadcast_to(-view[2], origins.shape)
+        faces.append(mesh.ray.intersects_first(origins, directions).reshape(across.shape))
+    return np.concatenate(faces)
 
 
 def _shades(

@@ -1,4 +1,4 @@
-"""The refinement loop: many objects, each with its population, in one compiled program."""
+"""Refinement: the searches of many objects in one compiled program (the loop is in `loop`)."""
 
 from typing import Any, NamedTuple
 

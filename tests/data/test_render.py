@@ -108,7 +108,7 @@ def test_without_embree_the_same_surface_is_seen(distance, monkeypatch):
     views = orbit(2, distance)
     intrinsics = camera.intrinsics_for(60.0, 64)
     depth, cosine = render.render_depth(random_chair(7), views, intrinsics, 64)
-    monkeypatch.setattr(render, "has_embree", lambda: False)
+    monkeypatch.setattr(render, "has_embree", False)
     monkeypatch.setattr("jaxshape.data.rays.PAIRS", 10_000)
     other_depth, other_cosine = render.render_depth(random_chair(7), views, intrinsics, 64)
     same = np.isclose(other_depth, depth, atol=1e-4) & np.isclose(other_cosine, cosine, atol=1e-3)
