@@ -138,12 +138,14 @@ COLUMNS = (
 )
 
 ABOUT = (
-    "The first figures are the shares of targets that were reached within so many decoder calls, or"
-    f" seconds, of each problem. Targets by objective leave {LEFT[0]:.0%} to {LEFT[-1]:.0%} of the"
-    " gap between the objective of the first code and the lowest known. Calls and seconds to 95 %"
-    " are medians over problems, a dash where fewer than half came so near. IoU is the IoU of"
-    " the last best code, gained its gain over the first code; targets by IoU are gains of"
-    f" {', '.join(f'{gain:g}' for gain in GAINS)} along the way. A gradient counts as three calls."
+    f'The columns "in ... calls" and "in {SECONDS:g} s" give the share of targets by objective that'
+    " were reached within that many decoder calls, or seconds, on each problem. The targets by"
+    f" objective leave {LEFT[0]:.0%} to {LEFT[-1]:.0%} of the gap between the objective of the"
+    ' first code and the lowest known one. "Calls to 95 %" and "s to 95 %" are medians over the'
+    " problems; a dash means that fewer than half of the problems got so near. IoU is that of the"
+    ' best code at the end, and "gained" is its gain over the first code. "IoU targets" is the'
+    f" share of the gains of {', '.join(f'{gain:g}' for gain in GAINS)} that were reached at any"
+    " time. One gradient counts as three decoder calls."
 )
 
 

@@ -53,20 +53,18 @@ class PlacementConfig:
         yaws: Directions of the front to start from, evenly spaced, 1 or more.
         overhangs: Distances by which boxes reach beyond the measured points on the sides that face
             away from the camera, in typical sizes, 0 or more.
-        tried: Number of proposed boxes that are moved with their shapes held, 1 or more.
-        kept: Number of tried boxes that are improved together with their codes, 1 or more.
+        kept: Number of boxes that are improved together with their codes, 1 or more.
         steps: Steps of Adam that improve each box and its code, 1 or more.
         steps_again: Steps of Adam where an earlier placement is known, 1 or more.
 
     Raises:
-        ValueError: A setting is outside its range, or more boxes are kept than tried or proposed.
+        ValueError: A setting is outside its range, or more boxes are kept than proposed.
     """
 
     typical_size: tuple[float, float, float] = (0.58, 0.86, 0.60)
     size_spread: tuple[float, float, float] = (0.34, 0.21, 0.29)
     yaws: int = 24
     overhangs: tuple[float, ...] = (0.0, 0.2, 0.5)
-    tried: int = 24
     kept: int = 4
     steps: int = 60
     steps_again: int = 25
@@ -78,11 +76,11 @@ class PlacementConfig:
         checks.whole("yaws", self.yaws, 1)
         for overhang in self.overhangs:
             checks.at_least("overhangs", overhang, 0)
-        for name in ("tried", "kept", "steps", "steps_again"):
+        for name in ("kept", "steps", "steps_again"):
             checks.whole(name, getattr(self, name), 1)
-        tried = min(self.tried, 1 + self.yaws * len(self.overhangs))
-        if self.kept > tried:
-            checks.refuse("kept", self.kept, f"at most the {tried} boxes that are tried")
+        proposed = 1 + self.yaws * len(self.overhangs)
+        if self.kept > proposed:
+            checks.refuse("kept", self.kept, f"at most the {proposed} boxes that are proposed")
 
 
 COMPARED_POINTS = 2048
@@ -296,19 +294,20 @@ def place(
     def holds(box, points):
         return fusion.count_points(to_voxels(box, points, n), n) > 0
 
-    def encoded(boxes):
+    @jax.jit  # traced once for all calls
+    def judged(boxes, codes):
+        """Boxes with their shapes: of the codes, or of what the network makes of the points."""
         occupied = jax.vmap(holds, (0, None))(boxes, seen.surface)
         occluded = ~(occupied | jax.vmap(holds, (0, None))(boxes, seen.free))
         grids = Grids(occupied, occluded)
+        codes = jnp.where(jnp.isnan(codes), encode(prior, grids), codes)
         decoder = prior.model.prepare(prior.params, grids, "float32")
-        return encode(prior, grids), decoder
-
-    def judged(boxes, codes, decoder):
         logits = decode_prepared(prior.model, decoder, codes)
-        hypothesis = Hypothesis(boxes, jax.vmap(space.from_code)(codes))
-        total = finite_or_inf(fits(logits, boxes) + _code_penalty(hypothesis.point))
-        return _Candidate(hypothesis, decoder.own, logits, total)
+        hypotheses = Hypothesis(boxes, jax.vmap(space.from_code)(codes))
+        total = finite_or_inf(fits(logits, boxes) + _code_penalty(hypotheses.point))
+        return _Candidate(hypotheses, decoder.own, logits, total)
 
+    @jax.jit
     def fitted(candidates):
         held = lambda boxes: fits(candidates.logits, boxes)  # noqa: E731
         boxes, fit = descend(candidates.hypothesis.box, held, _longer(unit), FIT_STEPS, rise=3)
@@ -316,23 +315,37 @@ def place(
         total = fit + _code_penalty(hypothesis.point)
         return candidates._replace(hypothesis=hypothesis, misfit=total)
 
-    boxes = propose(seen, floor, config)
+    # Boxes are judged in rounds of all fronts, the smallest boxes first. Where an earlier box is
+    # known, one round is enough to find a better front.
     earlier = _standing(_box_of(known, center), floor)
-    boxes = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), earlier, boxes)
-    codes, decoder = encoded(boxes)
-    tried = judged(boxes, codes.at[0].set(known.code), decoder)
-    tried = fitted(pick(tried, jnp.argsort(tried.misfit)[: config.tried]))
-    again = judged(tried.hypothesis.box, *encoded(tried.hypothesis.box))
+    boxes = jax.tree.map(
+        lambda x, y: jnp.concatenate([x[None], y]), earlier, propose(seen, floor, config)
+    )
+    each, is_known = max(1 + config.yaws, config.kept), jnp.isfinite(known.misfit)
+    unknown = jnp.full((each, prior.code_size), jnp.nan)
+
+    def one_round(i, best):
+        index = (i * each + jnp.arange(each)) % len(boxes.yaw)
+        codes = jnp.where((index == 0)[:, None], known.code, unknown)
+        more = judged(pick(boxes, index), codes)
+        both = jax.tree.map(lambda *x: jnp.concatenate(x), best, more)
+        return pick(both, jnp.argsort(both.misfit)[:each])
+
+    shapes = jax.eval_shape(judged, pick(boxes, jnp.arange(each)), unknown)
+    none = jax.tree.map(jnp.zeros_like, shapes)._replace(misfit=jnp.full(each, jnp.inf))
+    rounds = jnp.where(is_known, 1, -(-len(boxes.yaw) // each))
+    tried = fitted(lax.fori_loop(0, rounds, one_round, none))
+    again = judged(tried.hypothesis.box, unknown)
     tried = fitted(jax.vmap(select)(again.misfit < tried.misfit, again, tried))
 
     best = pick(tried, _most_promising(tried, config.kept))
-    shared = decoder._replace(own=best.own)
+    decoder = prior.model.prepare(prior.params, None, "float32")._replace(own=best.own)
 
     def misfits(hypothesis):
-        logits = decode_prepared(prior.model, shared, jax.vmap(space.to_code)(hypothesis.point))
+        logits = decode_prepared(prior.model, decoder, jax.vmap(space.to_code)(hypothesis.point))
         return fits(logits, hypothesis.box) + _code_penalty(hypothesis.point)
 
-    steps = jnp.where(jnp.isnan(known.misfit), config.steps, config.steps_again)
+    steps = jnp.where(is_known, config.steps_again, config.steps)
     whole = Hypothesis(unit, jnp.float32(0.1))
     improved, lowest = descend(best.hypothesis, misfits, whole, steps, rise=8)
     return _best_of(improved, lowest, center, space.to_code)
