@@ -14,8 +14,6 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from trimesh.resolvers import Resolver
-
 from jaxshape.limits import MESH_BYTES
 
 MESH_SUFFIXES = (".obj", ".off", ".ply", ".glb", ".gltf", ".stl")
@@ -280,22 +278,3 @@ def _read(read: Callable[[int], bytes], name: str) -> bytes:
     if len(content) > MAX_BYTES:
         raise TooLarge(f"{name!r} is larger than {MAX_BYTES // 2**20} MiB.")
     return content
-
-
-class RelativeFiles(Resolver):
-    """Reads the files that a mesh refers to, such as a glTF file's buffers, but no textures."""
-
-    def __init__(self, source: MeshSource):
-        self._read: Callable[[str], bytes] = lambda name: read_bytes(source, name)
-
-    def get(self, key: str) -> bytes:
-        return self._read(key)
-
-    def keys(self) -> list[str]:
-        return []
-
-    def write(self, name: str, data: bytes) -> None:
-        raise NotImplementedError("Meshes are only read here.")
-
-    def namespaced(self, namespace: str) -> "RelativeFiles":
-        raise NotImplementedError("Meshes are read with names relative to their own folder.")

@@ -1,16 +1,15 @@
 """Point clouds and fused models of one object, from PLY and PCD files. [host]"""
 
-import io
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from jaxshape.data.archives import MeshSource, RelativeFiles, read_bytes
-from jaxshape.data.formats.parts import MAX_FACES
+from jaxshape.data.archives import MeshSource, read_bytes
+from jaxshape.data.formats.ply import parse_ply
 from jaxshape.data.meshes import sample_oriented
 from jaxshape.data.pcd import parse_pcd
 
@@ -60,9 +59,9 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
         raise ValueError(f"{path} is no point cloud; expected {' or '.join(SUFFIXES)}: convert it.")
     try:
         content = read_bytes(MeshSource(path.stem, str(path)))
-        found = _read_ply(content, path, seed) if kind == ".ply" else _read_pcd(content)
+        found = _read_ply(content, seed) if kind == ".ply" else _read_pcd(content)
     except Exception as error:  # parsers of foreign files may raise anything
-        reason = " ".join(f"{error or type(error).__name__}".split())[:300]
+        reason = " ".join(f"{error or type(error).__name__}".split())[:300].rstrip(".")
         raise ValueError(
             f"{path} cannot be read as a point cloud ({reason}); expected a whole PLY or PCD file: "
             "save it again."
@@ -76,30 +75,22 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
     return cloud
 
 
-def _read_ply(content: bytes, path: Path, seed: int) -> Cloud:
-    loaded: Any = trimesh.load(
-        io.BytesIO(content),
-        file_type="ply",
-        resolver=RelativeFiles(MeshSource(path.stem, str(path))),
-        process=False,
-        skip_materials=True,
-    )
-    if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
-        return _from_faces(loaded, seed)
-    points = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
-    columns = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
-    return Cloud(points, _normals_of(columns, len(points)), None)
+def _read_ply(content: bytes, seed: int) -> Cloud:
+    vertices, faces, columns = parse_ply(content)
+    if len(faces):
+        return _from_faces(vertices, faces, seed)
+    return Cloud(vertices, _normals_of(columns, len(vertices)), None)
 
 
-def _from_faces(mesh: trimesh.Trimesh, seed: int) -> Cloud:
-    if len(mesh.faces) > MAX_FACES:
-        raise ValueError(f"it has {len(mesh.faces)} faces, more than {MAX_FACES}")
-    corners = mesh.vertices[mesh.faces]
+def _from_faces(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], seed: int
+) -> Cloud:
+    corners = vertices[faces]
     area = trimesh.triangles.area(corners)
     used = np.isfinite(corners).all(axis=(1, 2)) & (area > 0)
     if not used.any() or not np.isfinite(area[used].sum()):
         raise ValueError("its triangles have no area")
-    usable = trimesh.Trimesh(mesh.vertices, mesh.faces[used], process=False)
+    usable = trimesh.Trimesh(vertices, faces[used], process=False)
     return Cloud(*sample_oriented(usable, MAX_POINTS, seed), None)
 
 
@@ -111,12 +102,11 @@ def _read_pcd(content: bytes) -> Cloud:
     return Cloud(points, _normals_of(values, len(points)), viewpoint)
 
 
-def _normals_of(columns: Any, count: int) -> Float[np.ndarray, "n 3"] | None:
+def _normals_of(columns: dict[str, Any], count: int) -> Float[np.ndarray, "n 3"] | None:
     """Normals from fields with the names of PLY (nx) or PCD (normal_x)."""
-    names = getattr(getattr(columns, "dtype", None), "names", None) or tuple(columns)
     for pattern in ("n{}", "normal_{}"):
         wanted = [pattern.format(axis) for axis in "xyz"]
-        if all(name in names for name in wanted):
+        if all(name in columns for name in wanted):
             normals = np.stack([np.ravel(columns[name]) for name in wanted], axis=-1)
             return normals.astype(np.float64) if normals.shape == (count, 3) else None
     return None

@@ -93,6 +93,28 @@ def test_triangles_become_points_with_their_normals(tmp_path):
     assert along.min() > 0.98  # all of them outwards
 
 
+HEADER = "ply\n{}element vertex 300\nproperty float x\nproperty float y\nproperty float z\n{}"
+
+
+def test_a_ply_cloud_is_whole_or_refused(tmp_path):
+    """Text that ends early, and what other readers misread: a comment above the format, the grid of
+    a range scan, triangles beside polygons of more corners."""
+    file = tmp_path / "scan.ply"
+    half = "\n".join(" ".join(map(repr, row)) for row in POINTS[:150].tolist())
+    file.write_text(HEADER.format("format ascii 1.0\n", "end_header\n") + half)
+    with pytest.raises(ValueError, match="ends before all 300 of 'vertex'"):
+        read_cloud(file)
+    listed = "element {} {}\nproperty list uchar int vertex_indices\nend_header\n"
+    big = HEADER.format("comment a scan\nformat binary_big_endian 1.0\n", listed)
+    points = POINTS.astype(">f4").tobytes()
+    grid = b"".join(struct.pack(">Bi", 1, i) if i % 3 else b"\0" for i in range(400))
+    file.write_bytes(big.format("range_grid", 400).encode() + points + grid)
+    np.testing.assert_array_equal(read_cloud(file).points, POINTS)
+    faces = struct.pack(">B4i", 4, 0, 1, 2, 3) + struct.pack(">B3i", 3, 0, 4, 5)
+    file.write_bytes(big.format("face", 2).encode() + points + faces)
+    assert len(read_cloud(file).points) == MAX_POINTS
+
+
 def test_points_that_are_not_finite_are_left_out(tmp_path):
     points = POINTS.copy()
     points[::3, 1] = np.nan

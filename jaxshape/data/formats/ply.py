@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxshape.data.formats.parts import NotSupported, Part, Unreadable
 from jaxshape.data.formats.polygons import triangulate
@@ -44,8 +45,33 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
+class PlyFile(NamedTuple):
+    """The content of a PLY file.
+
+    Attributes:
+        vertices: Positions of the vertices.
+        faces: Its polygons and strips as triangles: indices into `vertices`.
+        columns: All properties of the vertices, by name: numbers `[v]`; a list has its numbers and
+            their number for each vertex.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    columns: dict[str, Any]
+
+
 def read_ply(content: bytes) -> list[Part]:
-    """The polygons of a PLY file as triangles.
+    """The polygons of a PLY file as triangles; raises as `parse_ply` does.
+
+    Args:
+        content: Content of the file.
+    """
+    file = parse_ply(content)
+    return [Part("", file.vertices, file.faces)]
+
+
+def parse_ply(content: bytes) -> PlyFile:
+    """The vertices of a PLY file with all their properties, and its polygons as triangles.
 
     Args:
         content: Content of the file.
@@ -69,7 +95,8 @@ def read_ply(content: bytes) -> list[Part]:
     except KeyError as problem:
         raise Unreadable(f"The file has no {problem}.") from problem
     vertices = vertices.astype(np.float64)
-    return [Part("", vertices, triangulate(vertices, *_polygons(elements, columns)))]
+    faces = triangulate(vertices, *_polygons(elements, columns))
+    return PlyFile(vertices, faces, columns["vertex"])
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
@@ -190,12 +217,16 @@ def _polygons(
     """Corners of all polygons of the file, and their number in each."""
     indices, counts = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for element in elements:
-        corners = [one for one in element.properties if one.count and one.name in _CORNERS]
-        if element.length == 0 or element.name not in ("face", "tristrips") and not corners:
+        if element.length == 0:
             continue
-        if element.name not in ("face", "tristrips") or not corners:
+        names = [one.name for one in element.properties if one.count and one.name in _CORNERS]
+        corners = [columns[element.name][name] for name in names]
+        has_faces = element.name in ("face", "tristrips")
+        if not has_faces and all(lengths.max() < 3 for _, lengths in corners):
+            continue  # a range scan lists the vertex of each cell of its grid
+        if not has_faces or not corners:
             raise NotSupported(f"The surface is in {element.name!r}; export faces with corners.")
-        flat, lengths = columns[element.name][corners[0].name]
+        flat, lengths = corners[0]
         flat = flat.astype(np.int64)
         if element.name == "tristrips":
             flat = _strips(flat, lengths)
