@@ -17,7 +17,7 @@ class Columns(NamedTuple):
     Attributes:
         values: The numbers of each field `[n]`, by its name.
         viewpoint: Position of the sensor `[3]`; None if the file does not give it, or gives the
-            default, the origin.
+            default, the origin, or numbers that are not finite.
     """
 
     values: dict[str, Float[np.ndarray, " n"]]
@@ -35,7 +35,8 @@ def parse_pcd(content: bytes) -> Columns:
     """
     header, body = _header(content)
     names, kinds, counts = header["FIELDS"], _kinds(header), _counts(header)
-    count = int(header.get("POINTS", header["WIDTH"])[0])
+    width, height = (int(header.get(name, ["1"])[0]) for name in ("WIDTH", "HEIGHT"))
+    count = int(header["POINTS"][0]) if "POINTS" in header else width * height
     if not 0 <= count <= limits.CLOUD_POINTS:
         raise ValueError(f"it holds {count} points; expected 0 to {limits.CLOUD_POINTS}")
     row = np.dtype(
@@ -45,6 +46,9 @@ def parse_pcd(content: bytes) -> Columns:
     if how == "ascii":
         columns = _ascii(body, counts, count)
     elif how == "binary":
+        size = row.itemsize * count
+        if len(body) < size or body[size:].strip(b"\0 \t\r\n"):
+            raise ValueError(f"{len(body)} bytes follow its header; expected {size}")
         table = np.frombuffer(body, row, count)
         columns = [table[str(i)] for i in range(len(names))]
     elif how == "binary_compressed":
@@ -57,7 +61,8 @@ def parse_pcd(content: bytes) -> Columns:
         if n == 1
     }
     place = np.array([float(word) for word in header.get("VIEWPOINT", ["0"] * 3)[:3]])
-    return Columns(values, place if place.shape == (3,) and place.any() else None)
+    is_known = place.shape == (3,) and place.any() and np.isfinite(place).all()
+    return Columns(values, place if is_known else None)
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -68,7 +73,7 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
         end = content.find(b"\n", start)
         if end < 0 or start > 10_000:
             raise ValueError("its header does not end in a line DATA")
-        words = content[start:end].decode("ascii").split()
+        words = content[start:end].decode("latin-1").split()
         start = end + 1
         if words and words[0] in _ENTRIES and len(words) > 1:
             header[words[0]] = words[1:]

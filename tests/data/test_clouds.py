@@ -58,6 +58,18 @@ def test_every_kind_of_pcd_gives_its_points(tmp_path, how):
     assert read_cloud(tmp_path / "scan.pcd").sensor is None
 
 
+def test_all_rows_of_an_organised_pcd_are_read_or_it_is_refused(tmp_path):
+    file = tmp_path / "scan.pcd"
+    header = "# café\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 100\n{}DATA binary\n"
+    file.write_bytes(header.format("HEIGHT 3\nVIEWPOINT nan 0 0\n").encode() + POINTS.tobytes())
+    cloud = read_cloud(file)
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert cloud.sensor is None
+    file.write_bytes(header.format("HEIGHT 3\nPOINTS 200\n").encode() + POINTS.tobytes())
+    with pytest.raises(ValueError, match="3600 bytes follow its header; expected 2400"):
+        read_cloud(file)
+
+
 def test_references_that_overlap_repeat_what_they_write():
     header = b"FIELDS x y z\nSIZE 1 1 1\nTYPE U U U\nWIDTH 9\nDATA binary_compressed\n"
     block = bytes([2, 1, 2, 3]) + bytes([7 << 5, 24 - 2 - 7, 2])  # 1 2 3, then 24 bytes 3 back
