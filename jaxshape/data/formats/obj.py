@@ -5,7 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxshape.data.formats.parts import NotSupported, Part, Unreadable, positions, text_of
+from jaxshape.data.formats.parts import (
+    NotSupported,
+    Part,
+    Unreadable,
+    positions,
+    text_of,
+    without_comments,
+)
 from jaxshape.data.formats.polygons import triangulate
 
 NOT_POLYGONS = {
@@ -56,10 +63,9 @@ def read_obj(content: bytes) -> list[Part]:
 
 
 def _statements(text: str) -> Iterator[list[str]]:
-    """Words of each line; a backslash continues a line, and `#` begins a comment."""
-    for line in text.replace("\\\n", " ").split("\n"):
-        words = (line.partition("#")[0] if "#" in line else line).split()
-        if words:
+    """Words of each line; a backslash continues a line, unless it ends a comment."""
+    for line in without_comments(text).replace("\\\n", " ").split("\n"):
+        if words := line.split():
             yield words
 
 

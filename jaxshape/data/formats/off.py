@@ -4,7 +4,14 @@ import re
 
 import numpy as np
 
-from jaxshape.data.formats.parts import NotSupported, Part, Unreadable, positions, text_of
+from jaxshape.data.formats.parts import (
+    NotSupported,
+    Part,
+    Unreadable,
+    positions,
+    text_of,
+    without_comments,
+)
 from jaxshape.data.formats.polygons import triangulate
 
 
@@ -19,7 +26,7 @@ def read_off(content: bytes) -> list[Part]:
         NotSupported: It is binary, or of another dimension than three.
         TooManyFaces: There are too many triangles.
     """
-    text = re.sub("#.*", "", text_of(content)).strip()
+    text = without_comments(text_of(content)).strip()
     kind = re.match(r"(ST)?C?N?(4)?(n)?OFF", text)
     if kind is None:
         raise Unreadable("The file does not begin with OFF.")

@@ -1,5 +1,6 @@
 """The results and errors of all readers of mesh files."""
 
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +60,18 @@ def text_of(content: bytes) -> str:
     wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
     text = content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def without_comments(text: str) -> str:
+    """The text without its comments, up to the end of their lines.
+
+    A comment begins at a `#` that begins a word: Windows writes `1.#QNAN` for a number that is not
+    finite.
+
+    Args:
+        text: Text with lines that end in a newline.
+    """
+    return re.sub(r"#(?<!\S#).*", "", text)
 
 
 def positions(rows: list[list[str]]) -> Float[np.ndarray, "v 3"]:

@@ -11,6 +11,7 @@ from jaxshape.data.formats.ply import read_ply
 from jaxshape.data.formats.stl import read_stl
 
 BOX = trimesh.creation.box((1, 2, 3))
+OFF = BOX.export(file_type="off")
 
 
 def test_numbers_below_zero_count_back_from_the_face():
@@ -45,12 +46,20 @@ def test_a_damaged_obj_is_refused(text, said):
         read_obj(text.encode())
 
 
+def test_a_comment_begins_a_word_and_ends_with_its_line():
+    """A path may end a comment with a backslash, and Windows writes NaN with a `#`."""
+    obj = "v 0 0 0 # first\n#\nv 1 0 0\nv 0 1 0\n# C:\\chairs\\\nf 1 2 3\n"
+    (part,) = read_obj(obj.encode())
+    assert part.faces.tolist() == [[0, 1, 2]] and part.vertices.tolist()[1] == [1, 0, 0]
+    with pytest.raises(Unreadable, match="not three numbers"):
+        read_obj(obj.replace("1 0 0", "1 0 1.#QNAN").encode())
+    with pytest.raises(Unreadable, match="not three numbers"):
+        read_off(OFF.replace("-1.5000000000\n", "-1.#IND\n", 1).encode())
+
+
 def test_surfaces_that_are_no_polygons_are_refused():
     with pytest.raises(NotSupported, match="free-form surfaces"):
         read_obj(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\ncstype bspline\nsurf 0 1 0 1 1 2 3\n")
-
-
-OFF = BOX.export(file_type="off")
 
 
 @pytest.mark.parametrize(
