@@ -1,5 +1,6 @@
 """PLY as text and binary: polygons and triangle strips, of any number of corners."""
 
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ _TYPES = {
 }  # fmt: skip
 
 _CORNERS = ("vertex_indices", "vertex_index")
+
+_END = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\r|\n)")
 
 
 class _Property(NamedTuple):
@@ -101,7 +104,8 @@ def parse_ply(content: bytes) -> PlyFile:
 
 def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
     """Encoding and elements of the file, and the bytes after its header."""
-    head, end, data = content.partition(b"end_header")
+    end = _END.search(content)
+    head = content[: end.start()] if end else b""
     lines = [line.split() for line in head.decode("latin-1").splitlines()]
     if not end or not lines or lines[0] != ["ply"]:
         raise Unreadable("The file has no header of a PLY file.")
@@ -123,7 +127,7 @@ def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
         raise Unreadable(f"The file is of the unknown format {encoding!r}.")
     if any(element.length < 0 for element in elements):
         raise Unreadable("The header gives a number of elements below 0.")
-    return encoding, elements, data[2:] if data[:2] == b"\r\n" else data[1:]
+    return encoding, elements, content[end.end() :]
 
 
 def _from_text(elements: list[_Element], data: bytes) -> tuple[list[_Element], bytes, str]:

@@ -113,6 +113,15 @@ def test_a_ply_file_is_whole_or_refused(text, error, said):
         read_ply(text.encode())
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n", " \n", "\t\r\n"])
+def test_a_ply_header_ends_with_the_line_of_its_end(end):
+    """Blanks may follow the word, and a comment may hold it."""
+    header, _, data = BOX.export(file_type="ply").partition(b"end_header\n")
+    header = header.replace(b"element vertex", b"comment of end_header\nelement vertex")
+    (part,) = read_ply(header + b"end_header" + end.encode() + data)
+    np.testing.assert_allclose(part.vertices[part.faces], BOX.triangles)
+
+
 def test_stl_is_whole_or_refused():
     binary, text = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").encode()
     for content in (binary, b"solid " + binary[6:], text):
