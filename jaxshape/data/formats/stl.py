@@ -23,7 +23,8 @@ def read_stl(content: bytes) -> list[Part]:
     count = int.from_bytes(content[80:_HEADER], "little")
     if len(content) == _HEADER + count * _FACE:
         return [_binary(content, count)]
-    if re.match(rb"\s*solid\b", content) and b"facet" in content:  # binary files may begin so, too
+    is_text = re.match(rb"(?i)(\xef\xbb\xbf)?\s*solid\b", content)  # binary files may begin so, too
+    if is_text and re.search(rb"(?i)facet", content):
         return [_text(text_of(content))]
     size = len(content)
     raise Unreadable(f"The header says {count} triangles, which does not fit {size} bytes.")
@@ -37,9 +38,10 @@ def _binary(content: bytes, count: int) -> Part:
 
 
 def _text(text: str) -> Part:
-    words = text.lower().split()
+    text = text.lower()
+    words = text.split()
     corners = [words[i + 1 : i + 4] for i, word in enumerate(words) if word == "vertex"]
-    facets, ends = text.lower().count("facet normal"), text.lower().count("endfacet")
+    facets, ends = len(re.findall(r"\bfacet\s+normal\b", text)), words.count("endfacet")
     if not len(corners) == 3 * facets == 3 * ends or "endsolid" not in words[-20:]:
         raise Unreadable(
             f"{facets} triangles begin, {ends} end, and there are {len(corners)} corners: "

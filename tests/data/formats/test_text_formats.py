@@ -124,7 +124,8 @@ def test_a_ply_header_ends_with_the_line_of_its_end(end):
 
 def test_stl_is_whole_or_refused():
     binary, text = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").encode()
-    for content in (binary, b"solid " + binary[6:], text):
+    others = (b"\xef\xbb\xbf" + text, text.upper(), text.replace(b" ", b"\t"))
+    for content in (binary, b"solid " + binary[6:], text, *others):
         (part,) = read_stl(content)
         np.testing.assert_allclose(part.vertices[part.faces], BOX.triangles, atol=1e-6)
     for content in (binary[:-50], binary + binary[-50:], text[: len(text) // 2]):
