@@ -160,35 +160,34 @@ def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> I
     mesh = file.list("meshes")[node["mesh"]]
     weights = node.get("weights", mesh.get("weights", []))
     for primitive in mesh["primitives"]:
-        mode = primitive.get("mode", _TRIANGLES)
-        if mode in _NO_SURFACE:
+        if primitive.get("mode", _TRIANGLES) in _NO_SURFACE:
             continue
-        attributes, corners = _arrays(file, primitive)
+        attributes, faces = _arrays(file, primitive)
         vertices = attributes["POSITION"].astype(np.float64)
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
             if weight and "POSITION" in target:
                 vertices = vertices + weight * file.accessor(target["POSITION"])
         if "skin" in node:
             vertices = _bent(file, node["skin"], placed, attributes, vertices)
-        part = Part(str(mesh.get("name", "")), vertices, _triangles(corners, mode))
-        yield checked(part)
+        yield checked(Part(str(mesh.get("name", "")), vertices, faces))
 
 
 def _arrays(
     file: GltfFile, primitive: dict[str, Any]
-) -> tuple[dict[str, np.ndarray], Int[np.ndarray, " n"]]:
-    """Attributes of the vertices of a primitive, and the indices of its corners."""
+) -> tuple[dict[str, np.ndarray], Int[np.ndarray, "f 3"]]:
+    """Attributes of the vertices of a primitive, and its triangles."""
     given = primitive["attributes"]
     wanted = [n for n in given if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_"))]
-    attributes, corners = draco_mesh(file, primitive) or ({}, None)
+    attributes, faces = draco_mesh(file, primitive) or ({}, None)
     attributes |= {n: file.accessor(given[n]) for n in wanted if n not in attributes}
     if "POSITION" not in attributes:
         raise Unreadable("A mesh of the file has no positions.")
-    if corners is None and "indices" in primitive:
+    if faces is not None:  # Draco stores triangles, also where the mode is that of strips
+        return attributes, faces
+    corners = np.arange(len(attributes["POSITION"]))
+    if "indices" in primitive:
         corners = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
-    if corners is None:
-        corners = np.arange(len(attributes["POSITION"]))
-    return attributes, corners
+    return attributes, _triangles(corners, primitive.get("mode", _TRIANGLES))
 
 
 def _triangles(corners: Int[np.ndarray, " n"], mode: int) -> Int[np.ndarray, "f 3"]:

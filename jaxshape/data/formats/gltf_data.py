@@ -188,7 +188,7 @@ def _file(uri: str, read_relative: Callable[[str], bytes]) -> bytes:
 def draco_mesh(
     file: GltfFile, primitive: dict[str, Any]
 ) -> tuple[dict[str, np.ndarray], np.ndarray] | None:
-    """Attributes and corners of a primitive that is compressed by Draco; None if it is not.
+    """Attributes and triangles of a primitive that is compressed by Draco; None if it is not.
 
     Args:
         file: The file.
@@ -216,4 +216,4 @@ def draco_mesh(
             limit = np.float64(np.iinfo(_TYPES[accessor["componentType"]]).max)
             values = np.maximum(values / limit, -1.0)
         attributes[name] = values
-    return attributes, np.asarray(decoded.faces, np.int64).ravel()
+    return attributes, np.asarray(decoded.faces, np.int64).reshape(-1, 3)

@@ -151,13 +151,13 @@ def test_only_the_scene_that_is_shown_counts():
     assert [part.name for part in read(gltf)] == ["shown"]
 
 
-@pytest.mark.parametrize("mixed", [False, True])
-def test_draco_is_decoded_beside_plain_primitives(mixed, monkeypatch):
+@pytest.mark.parametrize(("mixed", "mode"), [(False, 4), (True, 4), (False, 5)])
+def test_draco_is_decoded_beside_plain_primitives(mixed, mode, monkeypatch):
     draco = pytest.importorskip("DracoPy")
     gltf = Gltf(extensionsRequired=["KHR_draco_mesh_compression"])
     content = draco.encode(CORNERS, FACES.astype(np.uint32), preserve_order=True)
     about = {"bufferView": gltf.view(content), "attributes": {"POSITION": 0}}
-    packed = gltf.tetrahedron(extensions={"KHR_draco_mesh_compression": about})
+    packed = gltf.tetrahedron(extensions={"KHR_draco_mesh_compression": about}, mode=mode)
     for number in (packed["attributes"]["POSITION"], packed["indices"]):
         del gltf.header["accessors"][number]["bufferView"]
     primitives = [packed, gltf.tetrahedron()] if mixed else [packed]
