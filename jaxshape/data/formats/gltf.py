@@ -223,8 +223,8 @@ def _bent(
     weight = np.concatenate([attributes[f"WEIGHTS_{s}"] for s in sets], axis=1).astype(float)
     if joint.size and joint.max() >= len(joints):
         raise Unreadable("A vertex is bound to a joint that the skin does not have.")
-    total = weight.sum(axis=1)
-    weight = weight / np.where(total > 0, total, 1)[:, None]
+    weight[weight.sum(axis=1) == 0, 0] = 1  # as in viewers: only its first joint moves the vertex
+    weight /= weight.sum(axis=1, keepdims=True)
     homogeneous = np.append(vertices, np.ones((len(vertices), 1)), axis=1)
     moved = np.zeros((len(vertices), 3))
     for j, w in zip(joint.T, weight.T, strict=True):

@@ -93,11 +93,13 @@ def test_too_many_instances_are_refused_before_they_are_made():
 
 
 def test_a_skin_bends_the_mesh_and_forgets_its_own_place():
-    """Two corners hang on a joint that has moved by (0, 0, 4), two on the other."""
+    """Two corners hang on a joint that has moved by (0, 0, 4), one on another joint, and one has no
+    weights."""
     gltf = Gltf()
     joints = np.zeros((4, 4), np.uint8)
     joints[2:, 0] = 1
     weights = np.tile(np.array([1, 0, 0, 0], np.float32), (4, 1))
+    weights[1] = 0
     primitive = gltf.tetrahedron()
     primitive["attributes"] |= {"JOINTS_0": gltf.array(joints), "WEIGHTS_0": gltf.array(weights)}
     inverse = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
