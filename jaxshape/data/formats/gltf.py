@@ -122,15 +122,15 @@ def _transform(translation: Any, xyzw: Any, scale: Any) -> Matrix:
 def _shown(file: GltfFile) -> Iterator[tuple[int, list[str]]]:
     """Visible nodes of the scene, with the names of their ancestors."""
     nodes = file.list("nodes")
-    if scenes := file.list("scenes"):
-        roots = scenes[file.header.get("scene", 0)].get("nodes", [])
+    if file.list("scenes"):
+        roots = file.entry("scenes", file.header.get("scene", 0)).get("nodes", [])
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [i for i in range(len(nodes)) if i not in children]
     waiting = [(root, []) for root in reversed(roots)]
     while waiting:
         index, above = waiting.pop()
-        node = nodes[index]
+        node = file.entry("nodes", index)
         if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
             continue
         names = [*above, str(node.get("name", ""))]
@@ -157,7 +157,7 @@ def _instances(file: GltfFile, node: dict[str, Any]) -> Iterator[Matrix]:
 
 def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> Iterator[Part]:
     """The parts of a node's mesh, in the frame of the node or, if it has a skin, of the scene."""
-    mesh = file.list("meshes")[node["mesh"]]
+    mesh = file.entry("meshes", node["mesh"])
     weights = node.get("weights", mesh.get("weights", []))
     for primitive in mesh["primitives"]:
         if primitive.get("mode", _TRIANGLES) in _NO_SURFACE:
@@ -211,7 +211,7 @@ def _bent(
     vertices: Float[np.ndarray, "v 3"],
 ) -> Float[np.ndarray, "v 3"]:
     """Vertices moved by their joints, in the frame of the scene."""
-    about = file.list("skins")[skin]
+    about = file.entry("skins", skin)
     joints = np.stack([placed[i] for i in about["joints"]])
     if "inverseBindMatrices" in about:
         inverse = file.accessor(about["inverseBindMatrices"]).reshape(-1, 4, 4)

@@ -32,9 +32,24 @@ class GltfFile(NamedTuple):
         """An array of the header, such as its `nodes`; empty where it is missing."""
         return self.header.get(name, [])
 
+    def entry(self, name: str, index: Any) -> Any:
+        """The entry of an array of the header that has an index, which is 0 or more.
+
+        Args:
+            name: Name of the array, such as `nodes`.
+            index: The index, as the file gives it.
+
+        Raises:
+            Unreadable: The array has no such entry.
+        """
+        entries = self.list(name)
+        if not isinstance(index, int) or not 0 <= index < len(entries):
+            raise Unreadable(f"The file refers to {name}[{index}], which it does not have.")
+        return entries[index]
+
     def accessor(self, index: int) -> np.ndarray:
         """Numbers `[count width]` of an accessor; normalized integers are converted to floats."""
-        about = self.list("accessors")[index]
+        about = self.entry("accessors", index)
         kind, width, count = _TYPES[about["componentType"]], _WIDTHS[about["type"]], about["count"]
         if not 0 <= count * width * np.dtype(kind).itemsize <= MESH_BYTES:
             raise Unreadable(f"An accessor says that it has {count} entries.")
@@ -67,7 +82,7 @@ class GltfFile(NamedTuple):
 
     def view(self, index: int, kind: str, width: int, count: int, start: int) -> np.ndarray:
         """Numbers `[count width]` of a buffer view, from the byte `start` on."""
-        about, size = self.list("bufferViews")[index], np.dtype(kind).itemsize
+        about, size = self.entry("bufferViews", index), np.dtype(kind).itemsize
         content, row = self.view_bytes(index), about.get("byteStride", width * size)
         if start < 0 or row < 1 or start + (count - 1) * row + width * size > len(content):
             raise Unreadable(f"Buffer view {index} ends before the numbers that it should hold.")
@@ -79,7 +94,7 @@ class GltfFile(NamedTuple):
 
     def view_bytes(self, index: int) -> bytes:
         """All bytes of a buffer view."""
-        about = self.list("bufferViews")[index]
+        about = self.entry("bufferViews", index)
         content = self.buffers[about["buffer"]]
         if "EXT_meshopt_compression" in about.get("extensions", {}) or content is None:
             raise NotSupported(
@@ -211,7 +226,7 @@ def draco_mesh(
     attributes = {}
     for name, number in about["attributes"].items():
         values = given[number].reshape(len(given[number]), -1)
-        accessor = file.list("accessors")[primitive["attributes"][name]]
+        accessor = file.entry("accessors", primitive["attributes"][name])
         if accessor.get("normalized"):
             limit = np.float64(np.iinfo(_TYPES[accessor["componentType"]]).max)
             values = np.maximum(values / limit, -1.0)

@@ -207,6 +207,10 @@ def _no_data(gltf):
     del gltf.header["accessors"][0]["bufferView"]
 
 
+def _no_mesh(gltf):
+    gltf.header["nodes"][0]["mesh"] = -1  # which Python counts from the end
+
+
 def _odd(gltf):
     gltf.header["accessors"][1]["count"] = 11
 
@@ -219,6 +223,7 @@ def _odd(gltf):
         (_two_parents, "child of two nodes"),
         (_no_data, "no data"),
         (_odd, "11 corners"),
+        (_no_mesh, r"refers to meshes\[-1\], which it does not have"),
     ],
 )
 def test_files_that_break_the_rules_are_refused(damage, said):
