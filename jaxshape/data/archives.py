@@ -20,9 +20,9 @@ MESH_SUFFIXES = (".obj", ".off", ".ply", ".glb", ".gltf", ".stl")
 ARCHIVE_SUFFIXES = (".zip", ".sh3f")
 
 UNREAD_SUFFIXES = (
-    ".3ds", ".3mf", ".7z", ".abc", ".blend", ".c4d", ".dae", ".dxf", ".fbx", ".gz", ".iges", ".igs",
-    ".lwo", ".ma", ".max", ".mb", ".rar", ".skp", ".step", ".stp", ".tar", ".tgz", ".usd", ".usda",
-    ".usdc", ".usdz", ".vrml", ".wrl", ".x", ".x3d", ".xz",
+    ".3ds", ".3mf", ".7z", ".abc", ".blend", ".bz2", ".c4d", ".dae", ".dxf", ".fbx", ".gz", ".iges",
+    ".igs", ".lwo", ".ma", ".max", ".mb", ".rar", ".skp", ".step", ".stp", ".tar", ".tgz", ".usd",
+    ".usda", ".usdc", ".usdz", ".vrml", ".wrl", ".x", ".x3d", ".xz",
 )  # fmt: skip
 """Suffixes of meshes and archives that are not read; such files are only counted."""
 
@@ -80,7 +80,7 @@ def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
     root = Path(path)
     if not root.exists():
         raise FileNotFoundError(f"There is no file or folder {str(root)!r} to read meshes from.")
-    walked = _walk(root) if root.is_dir() else _Walked([root], [], 0)
+    walked = _walk(root)
     folder = root if root.is_dir() else root.parent
     found: list[tuple[str, MeshSource]] = []
     for closed in walked.closed:
@@ -101,7 +101,7 @@ def list_meshes(path: str | os.PathLike[str]) -> list[MeshSource]:
 
 
 class _Walked(NamedTuple):
-    """Names of the entries of a folder.
+    """Names of the entries of a folder, or of a single file.
 
     Attributes:
         files: All files that are not hidden.
@@ -115,6 +115,8 @@ class _Walked(NamedTuple):
 
 
 def _walk(folder: Path) -> _Walked:
+    if not folder.is_dir():
+        return _Walked([folder], [], 0)
     files, closed, links = [], [], 0
 
     def refuse(problem: OSError) -> None:
@@ -131,16 +133,28 @@ def passed_over(path: str | os.PathLike[str]) -> Counter[str]:
     """Number of files, for each suffix, that may be meshes but are not read.
 
     Args:
-        path: A folder; for a file, the result is empty.
+        path: A mesh, an archive, or a folder of both, whose archives are searched, too.
     """
-    if not Path(path).is_dir():
-        return Counter()
     walked = _walk(Path(path))
-    suffixes = (file.suffix.lower() for file in walked.files)
+    archives = [file for file in walked.files if file.suffix.lower() in ARCHIVE_SUFFIXES]
+    members = [PurePosixPath(name) for archive in archives for name in _members(archive)]
+    suffixes = (file.suffix.lower() for file in [*walked.files, *members])
     found = Counter(suffix for suffix in suffixes if suffix in UNREAD_SUFFIXES)
+    if nested := sum(member.suffix.lower() in ARCHIVE_SUFFIXES for member in members):
+        found["archives inside archives"] = nested
     if walked.links:
         found["linked folders"] = walked.links
     return found
+
+
+def _members(archive: Path) -> list[str]:
+    """Files in an archive that are not hidden; none if it cannot be opened, as loading reports."""
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            names = opened.namelist()
+    except Exception:  # zipfile raises many kinds on broken archives
+        return []
+    return [name for name in names if not name.endswith("/") and not _hidden(name)]
 
 
 def _hidden(path: str) -> bool:

@@ -160,6 +160,13 @@ def test_what_is_passed_over_is_counted(tmp_path):
     assert not passed_over(tmp_path / "a.obj")
 
 
+def test_what_archives_hold_beside_meshes_is_counted_too(tmp_path):
+    names = ("a.obj", "b.FBX", "c/d.fbx", "e.zip", "f.png", "__MACOSX/._g.fbx", "h.fbx/")
+    path = archive(tmp_path / "kit.zip", dict.fromkeys(names, OBJ))
+    (tmp_path / "broken.zip").write_text("no archive")
+    assert passed_over(path) == passed_over(tmp_path) == {".fbx": 2, "archives inside archives": 1}
+
+
 def test_equal_names_keep_their_suffix(tmp_path):
     for name in ("a.obj", "a.ply", "b.obj"):
         (tmp_path / name).write_text(OBJ)
