@@ -40,7 +40,8 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
     """Read a point cloud or a fused model.
 
     For a triangle mesh, points are sampled over its surface, with its normals. Points that are not
-    finite are left out; all normals are dropped if one of them has no length.
+    finite are left out, and so is the origin if it occurs more than once: cameras write it for
+    pixels without a measurement. All normals are dropped if one of them has no length.
 
     Args:
         path: A `.ply` or `.pcd` file.
@@ -66,7 +67,7 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
             f"{path} cannot be read as a point cloud ({reason}); expected a whole PLY or PCD file: "
             "save it again."
         ) from error
-    cloud = _drawn(_finite(found), seed)
+    cloud = _drawn(_measured(found), seed)
     if len(cloud.points) < FEWEST or np.ptp(cloud.points, axis=0).max() == 0:
         raise ValueError(
             f"{path} holds {len(cloud.points)} usable points; expected {FEWEST} or more, of one "
@@ -112,8 +113,11 @@ def _normals_of(columns: dict[str, Any], count: int) -> Float[np.ndarray, "n 3"]
     return None
 
 
-def _finite(cloud: Cloud) -> Cloud:
+def _measured(cloud: Cloud) -> Cloud:
     kept = np.isfinite(cloud.points).all(axis=1) & (np.abs(cloud.points) < 1e9).all(axis=1)
+    away = cloud.points.any(axis=1)
+    if np.sum(~away) > 1:
+        kept &= away
     normals = None if cloud.normals is None else cloud.normals[kept]
     if normals is not None:
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)

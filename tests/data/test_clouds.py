@@ -127,10 +127,11 @@ def test_a_ply_cloud_is_whole_or_refused(tmp_path):
     assert len(read_cloud(file).points) == MAX_POINTS
 
 
-def test_points_that_are_not_finite_are_left_out(tmp_path):
-    points = POINTS.copy()
-    points[::3, 1] = np.nan
-    write_pcd(tmp_path / "scan.pcd", "binary", points=points)
+@pytest.mark.parametrize("unmeasured", [(1.0, np.nan, 1.0), (0.0, 0.0, 0.0)])
+def test_points_that_are_not_measured_are_left_out(tmp_path, unmeasured):
+    points, normals = POINTS.copy(), NORMALS.copy()
+    points[::3], normals[::3] = unmeasured, 0
+    write_pcd(tmp_path / "scan.pcd", "binary", points=points, normals=normals)
     cloud = read_cloud(tmp_path / "scan.pcd")
     np.testing.assert_array_equal(cloud.points, POINTS[np.arange(300) % 3 > 0])
     assert len(cloud.normals) == 200
