@@ -113,6 +113,19 @@ def test_a_ply_file_is_whole_or_refused(text, error, said):
         read_ply(text.encode())
 
 
+@pytest.mark.parametrize("kind", ["int8", "int64", "uint64", "float16"])
+def test_numbers_of_a_ply_file_have_any_width(kind):
+    """Some scanners write the time of each point in 8 bytes."""
+    header, _, _ = HEADER.format("face").partition("end_header")
+    header = header.replace("ascii", "binary_little_endian")
+    header = header.replace("float z", f"float z\nproperty {kind} time")
+    rows = np.zeros(4, [("xyz", "<f4", 3), ("time", kind)])
+    rows["xyz"] = np.arange(12).reshape(4, 3)
+    face = np.array([3, 0, 1, 2], "<i4")
+    (part,) = read_ply(header.encode() + b"end_header\n" + rows.tobytes() + face.tobytes())
+    np.testing.assert_array_equal(part.vertices, rows["xyz"])
+
+
 @pytest.mark.parametrize("end", ["\n", "\r\n", " \n", "\t\r\n"])
 def test_a_ply_header_ends_with_the_line_of_its_end(end):
     """Blanks may follow the word, and a comment may hold it."""
