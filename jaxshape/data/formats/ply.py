@@ -128,6 +128,8 @@ def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
         raise Unreadable(f"The file is of the unknown format {encoding!r}.")
     if any(element.length < 0 for element in elements):
         raise Unreadable("The header gives a number of elements below 0.")
+    if len({element.name for element in elements}) < len(elements):
+        raise Unreadable("The header has two elements of one name.")
     return encoding, elements, content[end.end() :]
 
 

@@ -106,6 +106,7 @@ def test_strips_of_a_ply_file_are_triangles():
         (HEADER.format("face") + "3 0 1 2 3 0 1 3\n", Unreadable, "does not mention"),
         (HEADER.format("face") + "3 0 1 9\n", Unreadable, "does not hold"),
         (HEADER.replace("float z", "tensor z").format("face"), Unreadable, "not understood"),
+        (HEADER.format("vertex") + "3 0 1 2\n", Unreadable, "two elements of one name"),
     ],
 )
 def test_a_ply_file_is_whole_or_refused(text, error, said):
