@@ -8,7 +8,8 @@ from jaxtyping import Float
 from jaxshape import limits
 
 _ENTRIES = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
-_KINDS = {"F": "f", "I": "i", "U": "u"}
+_KINDS = ("F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8")
+"""Types of numbers, each with its size in bytes."""
 
 
 class Columns(NamedTuple):
@@ -34,7 +35,7 @@ def parse_pcd(content: bytes) -> Columns:
         ValueError: The file is damaged, or a field has several numbers of each point that are used.
     """
     header, body = _header(content)
-    names, kinds, counts = header["FIELDS"], _kinds(header), _counts(header)
+    names, counts, kinds = header["FIELDS"], _counts(header), _kinds(header)
     width, height = (int(header.get(name, ["1"])[0]) for name in ("WIDTH", "HEIGHT"))
     count = int(header["POINTS"][0]) if "POINTS" in header else width * height
     if not 0 <= count <= limits.CLOUD_POINTS:
@@ -83,14 +84,19 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
 
 
 def _kinds(header: dict[str, list[str]]) -> list[str]:
-    pairs = zip(header["TYPE"], header["SIZE"], strict=True)
-    return [f"<{_KINDS[kind]}{int(size)}" for kind, size in pairs]
+    kinds = [kind + size for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    if unknown := [kind for kind in kinds if kind not in _KINDS]:
+        raise ValueError(f"a field is of type {unknown[0]}; expected one of {', '.join(_KINDS)}")
+    return [f"<{kind.lower()}" for kind in kinds]
 
 
 def _counts(header: dict[str, list[str]]) -> list[int]:
     counts = [int(word) for word in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
-    if len(counts) != len(header["FIELDS"]) or len(counts) != len(header["SIZE"]):
-        raise ValueError("its header gives another number of sizes than of fields")
+    if {len(header[name]) for name in ("FIELDS", "SIZE", "TYPE")} != {len(counts)}:
+        raise ValueError("its header gives another number of sizes, types or counts than of fields")
+    used = [name.lower() for name in header["FIELDS"] if name != "_"]  # which is padding
+    if len(set(used)) < len(used):
+        raise ValueError("its header names a field twice")
     if min(counts) < 1 or max(counts) > 10_000:
         raise ValueError(f"its fields hold {counts} numbers")
     return counts

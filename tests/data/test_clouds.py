@@ -150,6 +150,9 @@ def test_points_that_are_not_measured_are_left_out(tmp_path, unmeasured):
             "2 numbers",
         ),
         ("scan.pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nWIDTH 1\nDATA ascii\n1 2", "no field z"),
+        ("scan.pcd", b"FIELDS x x\nSIZE 4 4\nTYPE F F\nWIDTH 9\nDATA ascii\n", "field twice"),
+        ("scan.pcd", b"FIELDS x\nSIZE 3\nTYPE F\nWIDTH 9\nDATA ascii\n", "of type F3; expected"),
+        ("scan.pcd", b"FIELDS x\nSIZE 4\nTYPE F F\nWIDTH 9\nDATA ascii\n", "than of fields"),
         ("scan.pcd", b"FIELDS x\nSIZE 4\nTYPE F\nWIDTH -4\nDATA binary\n", "-4 points"),
         (
             "scan.pcd",
