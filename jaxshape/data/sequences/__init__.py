@@ -57,7 +57,7 @@ from jaxshape.data.sequences.trajectories import Pinhole as Pinhole
 from jaxshape.data.sequences.trajectories import Trajectory as Trajectory
 from jaxshape.data.sequences.trajectories import read_trajectory as read_trajectory
 from jaxshape.data.sequences.trajectories import write_trajectory as write_trajectory
-from jaxshape.data.sequences.unread import unread
+from jaxshape.data.sequences.unread import unmatched, unread
 
 
 class Layout(NamedTuple):
@@ -134,8 +134,9 @@ def open_sequence(
     shape = _shape_of(listed)
     camera, cameras, doubts = _cameras(contents, listed, shape)
     has_poses, is_guess = listed.read_pose is not None, bool(doubts)
-    doubts += tuple(
-        unread(contents, has_poses=has_poses, has_camera=not is_guess, earlier=listed.findings)
+    doubts += (
+        *unmatched(contents, listed),
+        *unread(contents, has_poses=has_poses, has_camera=not is_guess, earlier=listed.findings),
     )
     files, remarks = _without_other_colors(listed, shape)
     return Sequence(

@@ -1,10 +1,11 @@
-"""Unread entries of a recording: not regular files, or files that look like poses or a camera."""
+"""Unread entries of a recording: not regular files, files that look like poses or a camera, and
+images that belong to no depth image."""
 
 import re
 from collections.abc import Iterator
 
 from jaxshape.data.sequences.frames import Finding
-from jaxshape.data.sequences.listing import Contents
+from jaxshape.data.sequences.listing import Contents, Listed, color_images, mask_images
 
 _POSES = re.compile(
     r"pose|traj|odom|groundtruth|ground_truth|transforms.*json|scene_gt|extrinsic|cameras?\.txt"
@@ -49,6 +50,28 @@ def unread(
         yield Finding(
             f"no camera is read, though {found} may hold it",
             "Write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt in the folder.",
+        )
+
+
+def unmatched(contents: Contents, listed: Listed) -> Iterator[Finding]:
+    """Remarks on colour images and masks that were not found for depth images.
+
+    Images that are paired by time are left to the inspection of a recording.
+    """
+    files, colors = listed.files, len(color_images(contents))
+    alone = sum(one.color is None for one in files)
+    if alone and listed.color_delays is None and (colors or alone < len(files)):
+        there = f", although there are {colors} of them" if colors else ""
+        yield Finding(
+            f"{alone} of {len(files)} depth images have no colour image{there}",
+            "Give images that were taken together the same number, and list them if the recording "
+            "has a list. If one kind is counted from 0 and the other from 1, all colours are a "
+            "frame late.",
+        )
+    if (masks := len(mask_images(contents))) and not any(one.mask for one in files):
+        yield Finding(
+            f"none of {masks} masks is read",
+            "Give each mask the name of its depth image, and list it if the recording has a list.",
         )
 
 

@@ -146,6 +146,27 @@ def test_tum_without_colours_or_poses(tmp_path):
     assert not sequence.has_poses and sequence[0].color is None and sequence.color_delays is None
 
 
+def test_tum_colours_without_a_list_are_found_by_name_or_missed(tmp_path):
+    write_tum(tmp_path, SEEN, color_delay=0)
+    (tmp_path / "rgb.txt").unlink()
+    sequence = open_sequence(tmp_path)
+    np.testing.assert_array_equal(sequence[3].color, SEEN.color[3])
+    assert sequence.color_delays is None and not sequence.findings
+    (tmp_path / "rgb").rename(tmp_path / "old")
+    (tmp_path / "rgb").mkdir()
+    save(tmp_path / "rgb/first.png", SEEN.color[0])
+    (remark,) = open_sequence(tmp_path).findings
+    assert "6 of 6 depth images have no colour" in remark.evidence
+
+
+def test_masks_of_other_names_are_named(tmp_path):
+    write_bundlesdf(tmp_path, SEEN)
+    for path in sorted((tmp_path / "masks").iterdir()):
+        path.rename(path.with_stem(f"1{path.stem}"))
+    (remark,) = open_sequence(tmp_path).findings
+    assert "none of 6 masks is read" in remark.evidence
+
+
 # Poses -----------------------------------------------------------------------------------------
 
 

@@ -136,6 +136,20 @@ def test_an_empty_folder_is_of_no_layout_that_is_asked_for(tmp_path, name):
         open_sequence(tmp_path, layout=name)
 
 
+@pytest.mark.parametrize(
+    "name, folder",
+    [("scannet", "color"), ("bop", "rgb"), ("wildrgb-d", "rgb"), ("record3d", "rgb")],
+)
+def test_colours_that_are_counted_from_another_number_are_named(tmp_path, name, folder):
+    WRITERS[name](tmp_path, SEEN)
+    before = open_sequence(tmp_path).findings
+    for path in sorted((tmp_path / folder).iterdir(), reverse=True):
+        path.rename(path.with_stem(str(int(path.stem) + 1).zfill(len(path.stem))))
+    (remark,) = set(open_sequence(tmp_path).findings) - set(before)
+    assert "1 of 5 depth images have no colour image, although" in remark.evidence
+    assert "there are 5" in remark.evidence and "a frame late" in remark.advice
+
+
 # ScanNet, WildRGB-D, Replica -------------------------------------------------------------------
 
 
@@ -244,6 +258,8 @@ def test_an_angle_of_view_and_images_without_suffix(tmp_path):
         frame["file_path"] = frame["file_path"].removesuffix(".png")
         for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
             del frame[name]
+    path = tmp_path / "images/frame_00003.png"
+    path.rename(path.with_suffix(".tiff"))
     angle = 2 * np.arctan(W / 2 / SEEN.K[0, 0, 0])
     edit(tmp_path, frames=about["frames"], camera_angle_x=float(angle))
     frame = open_sequence(tmp_path)[2]

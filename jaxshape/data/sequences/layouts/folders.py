@@ -9,11 +9,7 @@ from jaxtyping import Float
 
 from jaxshape import reading
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
-from jaxshape.data.sequences.frames import (
-    Finding,
-    SequenceError,
-    usual_depth_scale,
-)
+from jaxshape.data.sequences.frames import SequenceError, usual_depth_scale
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
@@ -106,28 +102,13 @@ def list_open3d(contents: Contents) -> Listed:
 
 
 def _by_name(contents: Contents) -> Listed:
-    depth, offered = depth_images(contents), color_images(contents)
-    color = partners(depth, offered)
+    depth = depth_images(contents)
     read = _pose_files(contents, list(depth)) or _trajectory_poses(contents, len(depth))
     return Listed(
-        files=frame_files(contents, depth, color),
+        files=frame_files(contents, depth),
         depth_scale=usual_depth_scale(depth.values()),
         read_pose=read,
         camera=DefaultCamera(PRIMESENSE, "Open3D's default, a PrimeSense", sure=False),
-        findings=_lone_colors(len(offered), color),
-    )
-
-
-def _lone_colors(offered: int, found: list[Path | None]) -> tuple[Finding, ...]:
-    used = sum(path is not None for path in found)
-    if not offered or used == len(found):
-        return ()
-    return (
-        Finding(
-            f"{len(found) - used} of {len(found)} depth images have no colour image of the same "
-            f"name or number, although there are {offered} colour images",
-            "Give both the same names, if they were taken together.",
-        ),
     )
 
 

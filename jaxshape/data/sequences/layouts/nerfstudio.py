@@ -16,6 +16,7 @@ from jaxshape.data.sequences.frames import (
     usual_depth_scale,
 )
 from jaxshape.data.sequences.listing import (
+    COLOR_SUFFIXES,
     Contents,
     Listed,
     depth_images,
@@ -105,11 +106,10 @@ def _depth_of(contents: Contents, frames: list[dict[str, Any]], source: Path) ->
 def _files(folder: Path, frame: dict[str, Any], depth: Path | None, source: Path) -> FrameFiles:
     assert depth is not None
     name, mask = frame.get("file_path"), frame.get("mask_path")
-    color = below(folder, name, source) if name else None
-    if color is not None and not color.suffix:  # names in Blender's synthetic scenes
-        color = color.with_suffix(".png")
-    if color is not None and not color.is_file():
-        color = None
+    # Blender's synthetic scenes name files without suffix.
+    names = [f"{name}{end}" for end in ("", *COLOR_SUFFIXES)] if name else []
+    colors = (below(folder, one, source) for one in names)
+    color = next((path for path in colors if path.is_file()), None)
     return FrameFiles(depth.stem, depth, color, below(folder, mask, source) if mask else None)
 
 

@@ -14,6 +14,7 @@ from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
+    color_images,
     mask_images,
     partners,
     with_colors_by_time,
@@ -36,8 +37,8 @@ def fits(contents: Contents) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`depth.txt`, and optionally `rgb.txt` and `groundtruth.txt`, with the same clock.
 
-    Each depth image gets the colour image nearest in time, and a pose interpolated between the
-    poses before and after it.
+    Each depth image gets the colour image nearest in time, or without `rgb.txt` the one of the same
+    name, and a pose interpolated between the poses before and after it.
     """
     folder = contents.folder
     times, depth = _read_list(folder / "depth.txt")
@@ -45,19 +46,18 @@ def list_frames(contents: Contents) -> Listed:
         raise SequenceError(
             f"{folder / 'depth.txt'} lists no image; expected lines of `time file`: write them."
         )
-    color_times, offered = np.zeros(0), []
-    if "rgb.txt" in contents.files:
-        color_times, offered = _read_list(folder / "rgb.txt")
-    color, delays = with_colors_by_time(times, color_times, offered)
-    read_pose, doubts = _poses(folder / "groundtruth.txt", times)
     names = [path.stem for path in depth]
+    color, delays = partners(names, color_images(contents)), None
+    if "rgb.txt" in contents.files:
+        color, delays = with_colors_by_time(times, *_read_list(folder / "rgb.txt"))
+    read_pose, doubts = _poses(folder / "groundtruth.txt", times)
     masks = partners(names, mask_images(contents))
     return Listed(
         files=tuple(map(FrameFiles, names, depth, color, masks)),
         depth_scale=5000.0,
         read_pose=read_pose,
         times=times,
-        color_delays=delays if offered else None,
+        color_delays=delays,
         camera=_camera_of(folder),
         findings=doubts,
     )
