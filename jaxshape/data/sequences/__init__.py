@@ -134,9 +134,10 @@ def open_sequence(
     shape = _shape_of(listed)
     camera, cameras, doubts = _cameras(contents, listed, shape)
     has_poses, is_guess = listed.read_pose is not None, bool(doubts)
+    is_default = listed.camera is not None and camera.source == listed.camera.source
     doubts += (
         *unmatched(contents, listed),
-        *unread(contents, has_poses=has_poses, has_camera=not is_guess, earlier=listed.findings),
+        *unread(contents, has_poses=has_poses, has_camera=not is_default, earlier=listed.findings),
     )
     files, remarks = _without_other_colors(listed, shape)
     return Sequence(

@@ -127,6 +127,24 @@ def test_tum_cameras_are_known_by_the_name_of_the_folder(tmp_path, folder, fx, c
     assert [len(sequence.findings), "ROS" in sequence.camera] in ([0, False], [1, True])
 
 
+@pytest.mark.parametrize("write, folder", [(write_tum, "fr1"), (write_redwood, "chair")])
+def test_a_camera_that_is_not_read_is_named_though_another_is_known(tmp_path, write, folder):
+    write(tmp_path / folder, SEEN)
+    for name in ("calibration.txt", "cam_K.txt"):
+        (tmp_path / folder / name).unlink(missing_ok=True)
+    assert not open_sequence(tmp_path / folder).findings
+    (tmp_path / folder / "intrinsics.txt").write_text("60 0 32\n0 60 24\n0 0 1\n")
+    (remark,) = open_sequence(tmp_path / folder).findings
+    assert "no camera is read, though intrinsics.txt may hold it" in remark.evidence
+
+
+def test_rotated_depth_of_sun3d_is_refused_by_name(tmp_path):
+    write_redwood(tmp_path, SEEN, scale=8000, poses=False)
+    (tmp_path / "cam_K.txt").rename(tmp_path / "intrinsics.txt")
+    (tmp_path / "extrinsics").mkdir()
+    assert "SUN3D, whose depth images hold millimetres that are rotated" in fault_of(tmp_path)
+
+
 def test_tum_poses_between_and_outside_those_given(tmp_path):
     write_tum(tmp_path, SEEN)
     path = tmp_path / "groundtruth.txt"

@@ -50,6 +50,12 @@ def list_redwood(contents: Contents) -> Listed:
     The streams are not synchronised: each depth image gets the colour image nearest in time. There
     are no poses, unless there is a trajectory file beside the folders.
     """
+    if "intrinsics.txt" in contents.files and "extrinsics" in contents.folders:
+        raise SequenceError(
+            f"{contents.folder} is a recording of SUN3D, whose depth images hold millimetres that "
+            "are rotated by three bits; expected plain millimetres: save (d >> 3) | (d << 13) of "
+            "each 16-bit image d to another folder, and intrinsics.txt as cam_K.txt beside it."
+        )
     depth, offered = depth_images(contents), color_images(contents)
     offered = {name: path for name, path in offered.items() if _STAMPED.fullmatch(name)}
     times, color_times = _stamps(depth), _stamps(offered)
