@@ -169,6 +169,14 @@ def test_wild_rgbd_poses_are_found_by_the_number_of_the_image(tmp_path):
     np.testing.assert_allclose(sequence[3].T_world_camera, SEEN.T_world_camera[3], atol=1e-9)
 
 
+def test_poses_of_replica_stay_with_their_images_when_some_are_removed(tmp_path):
+    write_replica(tmp_path, SEEN)
+    for number in (0, 2):
+        (tmp_path / f"results/depth{number:06d}.png").unlink()
+    for frame, T in zip(open_sequence(tmp_path), SEEN.T_world_camera[[1, 3, 4]], strict=True):
+        np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-9)
+
+
 def test_a_trajectory_of_tum_called_traj_is_not_replica(tmp_path):
     write_replica(tmp_path, SEEN)
     (tmp_path / "results").rename(tmp_path / "depth")

@@ -24,6 +24,7 @@ from jaxshape.data.sequences.listing import (
     files_in,
     frame_files,
     has_depth_folder,
+    last_number,
     partners,
 )
 from jaxshape.data.sequences.poses import known
@@ -54,8 +55,9 @@ def _is_matrices(path: Path) -> bool:
 def list_frames(contents: Contents) -> Listed:
     """`results/depthN.png` and `results/frameN.jpg`, or `depth/` and `rgb/`, and `traj.txt`.
 
-    Line i of `traj.txt` is the camera-to-world matrix of the i-th image, by rows. The camera and
-    the depth scale come from `cam_params.json`, here or in the parent folder.
+    Line i of `traj.txt` is the camera-to-world matrix of the i-th image, by rows; if there are more
+    lines or fewer than images, of the image of number i, from 0. The camera and the depth scale
+    come from `cam_params.json`, here or in the parent folder.
     """
     if "results" in contents.folders:
         every = files_in(contents, ("results",), COLOR_SUFFIXES + DEPTH_SUFFIXES)
@@ -68,9 +70,11 @@ def list_frames(contents: Contents) -> Listed:
         raise SequenceError(f"{contents.folder} holds no traj.txt; copy it there.")
     poses = np.array(rows_of(source, (16,))).reshape(-1, 4, 4)
     calibration, scale = _calibration(contents)
+    lines = range(len(depth)) if len(poses) == len(depth) else list(map(last_number, depth))
 
     def read(index: int):
-        return known(poses[index], f"Line {index} of {source}") if index < len(poses) else None
+        line = lines[index]
+        return known(poses[line], f"Line {line} of {source}") if 0 <= line < len(poses) else None
 
     return Listed(
         files=frame_files(contents, depth, partners(depth, offered)),
