@@ -177,6 +177,16 @@ def test_poses_of_replica_stay_with_their_images_when_some_are_removed(tmp_path)
         np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-9)
 
 
+def test_replica_of_semantic_nerf_is_in_millimetres(tmp_path):
+    for i, depth in enumerate(SEEN.depth):
+        save(tmp_path / f"depth/depth_{i}.png", raw(depth, 1000))
+    np.savetxt(tmp_path / "traj_w_c.txt", SEEN.T_world_camera.reshape(-1, 16))
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    sequence = open_sequence(tmp_path)
+    assert sequence.layout == "replica"
+    np.testing.assert_allclose(sequence[3].depth, SEEN.depth[3], rtol=1e-6)
+
+
 def test_a_trajectory_of_tum_called_traj_is_not_replica(tmp_path):
     write_replica(tmp_path, SEEN)
     (tmp_path / "results").rename(tmp_path / "depth")

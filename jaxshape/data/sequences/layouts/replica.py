@@ -1,4 +1,5 @@
-"""Replica (Straub et al., 2019) as NICE-SLAM renders it: `traj.txt` and images in `results/`."""
+"""Replica (Straub et al., 2019) as NICE-SLAM, Semantic-NeRF and vMAP render it: `traj.txt` or
+`traj_w_c.txt`, and images."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -29,8 +30,9 @@ from jaxshape.data.sequences.listing import (
 )
 from jaxshape.data.sequences.poses import known
 
-_POSES = ("traj.txt", "traj_w_c.txt")
-_SCALE = 6553.5
+_SCALES = {"traj.txt": 6553.5, "traj_w_c.txt": 1000.0}
+"""Depth units per metre by the name of the poses: of NICE-SLAM, and of Semantic-NeRF and vMAP."""
+
 _CAMERA = (600.0, 600.0, 599.5 + 0.5, 339.5 + 0.5)
 _SHAPE = (680, 1200)
 
@@ -44,7 +46,7 @@ def fits(contents: Contents) -> bool:
 
 
 def _poses(contents: Contents) -> Path | None:
-    return next((contents.folder / name for name in _POSES if name in contents.files), None)
+    return next((contents.folder / name for name in _SCALES if name in contents.files), None)
 
 
 def _is_matrices(path: Path) -> bool:
@@ -69,7 +71,7 @@ def list_frames(contents: Contents) -> Listed:
     if source is None:
         raise SequenceError(f"{contents.folder} holds no traj.txt; copy it there.")
     poses = np.array(rows_of(source, (16,))).reshape(-1, 4, 4)
-    calibration, scale = _calibration(contents)
+    calibration, scale = _calibration(contents, _SCALES[source.name])
     lines = range(len(depth)) if len(poses) == len(depth) else list(map(last_number, depth))
 
     def read(index: int):
@@ -84,7 +86,7 @@ def list_frames(contents: Contents) -> Listed:
     )
 
 
-def _calibration(contents: Contents) -> tuple[Calibration | None, float]:
+def _calibration(contents: Contents, usual: float) -> tuple[Calibration | None, float]:
     for folder in (contents.folder, contents.folder.resolve().parent):
         source = folder / "cam_params.json"
         if source.is_file():
@@ -92,12 +94,12 @@ def _calibration(contents: Contents) -> tuple[Calibration | None, float]:
             inner = about.get("camera")
             about = inner if isinstance(inner, dict) else about
             names = ("fx", "fy", "cx", "cy", "h", "w", "scale")
-            values = [about.get(name, _SCALE if name == "scale" else None) for name in names]
+            values = [about.get(name, usual if name == "scale" else None) for name in names]
             fx, fy, cx, cy, h, w, scale = matrix_of(values, (7,), source, ", ".join(names)).tolist()
             if not (np.isfinite(scale) and scale > 0):
                 raise SequenceError(f"{source} gives the scale {scale:g}; expected one above 0.")
             K = matrices_of(fx, fy, cx + 0.5, cy + 0.5)
             return Calibration(K, shape_of(h, w, source), source.name), scale
     if "cam_K.txt" in contents.files:
-        return None, _SCALE
-    return Calibration(matrices_of(*_CAMERA), _SHAPE, "NICE-SLAM's camera for Replica"), _SCALE
+        return None, usual
+    return Calibration(matrices_of(*_CAMERA), _SHAPE, "NICE-SLAM's camera for Replica"), usual
