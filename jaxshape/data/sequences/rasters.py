@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
+from PIL.PpmImagePlugin import PpmImageFile
 
 from jaxshape import limits, reading
 from jaxshape.data.sequences.errors import SequenceError
@@ -64,12 +65,22 @@ def open_picture(picture: Picture, most: int) -> Iterator[Image.Image]:
                 with Image.open(file, formats=FORMATS) as image:
                     image.filename = str(picture)
                     _check_size(image.width, image.height, most)
+                    _keep_numbers(image)
                     yield image
 
 
 def _check_size(width: int, height: int, most: int) -> None:
     if not 0 < width * height <= most:
         raise ValueError(f"it has {width} x {height} pixels; {most:,} at most are read")
+
+
+def _keep_numbers(image: Image.Image) -> None:
+    """Undo that Pillow stretches the numbers of a PGM file of 16 bits, from the largest one that
+    its header allows, to 65535."""
+    if isinstance(image, PpmImageFile) and image.mode == "I":
+        tile = image.tile[0]
+        if isinstance(tile.args, tuple):  # it ends with the largest number
+            image.tile = [tile._replace(args=(*tile.args[:-1], 65535))]
 
 
 def _from_array(array: Any, most: int) -> Image.Image:

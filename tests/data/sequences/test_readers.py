@@ -349,6 +349,18 @@ def test_floats_are_metres_in_folders_of_any_usual_name(tmp_path, folder, suffix
     np.testing.assert_allclose(frame.depth[2:], SEEN.depth[3][2:], rtol=1e-6)
 
 
+@pytest.mark.parametrize("most", [4095, 10_000, 65_535])
+@pytest.mark.parametrize("kind", [b"P2", b"P5"])
+def test_a_pgm_file_holds_numbers_whatever_the_largest_may_be(tmp_path, kind, most):
+    (tmp_path / "depth").mkdir()
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    deep = raw(SEEN.depth[0], 1000)
+    plain = " ".join(map(str, deep.ravel())).encode()
+    body = deep.astype(">u2").tobytes() if kind == b"P5" else plain
+    (tmp_path / "depth/0.pgm").write_bytes(b"%s\n%d %d\n%d\n" % (kind, W, H, most) + body)
+    np.testing.assert_allclose(open_sequence(tmp_path)[0].depth, SEEN.depth[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("array", [np.zeros(5), np.zeros((2, 3, 4, 5)), np.array([["a"]])])
 def test_arrays_that_are_no_images_are_refused(tmp_path, array):
     (tmp_path / "depth").mkdir()
