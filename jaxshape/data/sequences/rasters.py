@@ -18,6 +18,9 @@ FORMATS = ("PNG", "JPEG", "TIFF", "PPM")
 excluded."""
 
 
+_MOST = np.iinfo(np.int32).max
+
+
 class Stored(NamedTuple):
     """An image that is an array in a larger file.
 
@@ -84,7 +87,8 @@ def _keep_numbers(image: Image.Image) -> None:
 
 
 def _from_array(array: Any, most: int) -> Image.Image:
-    """An image from an array; numbers other than 8 and 16 bit unsigned become floats."""
+    """An image from an array; whole numbers other than 8 and 16 bit unsigned get 32 bits, and
+    others become floats."""
     array = np.asarray(array)
     if array.ndim == 3 and array.shape[0] == 1:
         array = array[0]
@@ -98,8 +102,11 @@ def _from_array(array: Any, most: int) -> Image.Image:
     if array.dtype not in (np.uint8, np.uint16):
         if array.dtype.kind not in "iuf":
             raise ValueError(f"it is an array of {array.dtype}, not of numbers")
-        with np.errstate(over="ignore"):
-            array = array.astype(np.float32)
+        if array.dtype.kind in "iu":
+            array = array.clip(0, _MOST).astype(np.int32)  # no depth is below 0
+        else:
+            with np.errstate(over="ignore"):
+                array = array.astype(np.float32)
     return Image.fromarray(np.ascontiguousarray(array))
 
 

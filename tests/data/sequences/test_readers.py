@@ -349,6 +349,14 @@ def test_floats_are_metres_in_folders_of_any_usual_name(tmp_path, folder, suffix
     np.testing.assert_allclose(frame.depth[2:], SEEN.depth[3][2:], rtol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["<u2", ">u2", "<i2", "<i4", "<u4", "<i8", "<u8"])
+def test_whole_numbers_of_any_kind_are_millimetres(tmp_path, kind):
+    (tmp_path / "depth").mkdir()
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    np.save(tmp_path / "depth/0.npy", raw(SEEN.depth[0], 1000).astype(kind))
+    np.testing.assert_allclose(open_sequence(tmp_path)[0].depth, SEEN.depth[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("most", [4095, 10_000, 65_535])
 @pytest.mark.parametrize("kind", [b"P2", b"P5"])
 def test_a_pgm_file_holds_numbers_whatever_the_largest_may_be(tmp_path, kind, most):
