@@ -111,7 +111,7 @@ def _from_array(array: Any, most: int) -> Image.Image:
 
 
 def _read_exr(path: Path, most: int) -> np.ndarray:
-    """The depth channel of an EXR file: Z, Y, R or the only one."""
+    """The depth channel of an EXR file."""
     try:
         import OpenEXR  # type: ignore[import-not-found]
     except ImportError:
@@ -127,7 +127,21 @@ def _read_exr(path: Path, most: int) -> np.ndarray:
     _check_size(right - left + 1, bottom - top + 1, most)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: np.array(one.pixels) for name, one in file.channels().items()}
-    for name in ("Z", "Y", "R", *channels):
-        if name in channels:
-            return channels[name]
-    raise ValueError("it has no channel")
+    return channels[depth_channel(list(channels))]
+
+
+def depth_channel(names: list[str]) -> str:
+    """The channel of an EXR file that is called depth, or else Z, V, Y or R, or the only one.
+
+    Args:
+        names: Names of the channels, perhaps with a layer, such as `ViewLayer.Depth.Z`.
+
+    Raises:
+        ValueError: No name, or more than one, is that of a depth channel.
+    """
+    called = [name for name in names if "depth" in name.lower()]
+    by_end = ([name for name in names if name.rsplit(".")[-1] == end] for end in "ZVYR")
+    for found in (called, *by_end, names):
+        if len(found) == 1:
+            return found[0]
+    raise ValueError(f"none of its channels ({', '.join(names)}) is the one that is called depth")

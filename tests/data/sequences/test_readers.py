@@ -25,6 +25,7 @@ from recordings import OPENCV, H, W, raw, save
 
 from jaxshape.data.sequences import LAYOUTS, SequenceError, open_sequence
 from jaxshape.data.sequences.evidence import agreement, seen_by, telling_pairs
+from jaxshape.data.sequences.rasters import depth_channel
 
 SEEN = shoot()
 
@@ -391,6 +392,29 @@ def test_exr_is_read_or_refused_by_name(tmp_path):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"Y": depth}).write(str(path))
     np.testing.assert_array_equal(open_sequence(tmp_path)[0].depth, depth)
+
+
+@pytest.mark.parametrize(
+    "names, chosen",
+    [
+        ("A B G R Z", "Z"),
+        ("B G R", "R"),
+        ("V", "V"),
+        ("B G R depth.V", "depth.V"),
+        ("ViewLayer.Combined.A ViewLayer.Combined.R ViewLayer.Depth.Z", "ViewLayer.Depth.Z"),
+        ("View.Combined.R View.Depth.Z View.Normal.X View.Normal.Z", "View.Depth.Z"),
+        ("Image.B Image.G Image.R", "Image.R"),
+        ("distance", "distance"),
+    ],
+)
+def test_depth_is_never_another_channel_of_exr(names, chosen):
+    assert depth_channel(names.split()) == chosen
+
+
+def test_channels_without_depth_are_refused_by_name():
+    for names in (["A", "U"], ["a.Z", "b.Z"], []):
+        with pytest.raises(ValueError, match="none of its channels"):
+            depth_channel(names)
 
 
 # RealSense -------------------------------------------------------------------------------------
