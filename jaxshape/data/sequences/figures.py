@@ -1,6 +1,7 @@
 """Statistics of a recording: of its poses, names and times, and of a sample of its images."""
 
 import math
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxshape.data.sequences.frames import (
     read_raw_depth,
 )
 from jaxshape.data.sequences.hypotheses import Reading
-from jaxshape.data.sequences.listing import numbers_in
+from jaxshape.data.sequences.listing import number_pattern
 
 SAMPLES = 12
 """Number of frames, spread over a recording, whose images are read."""
@@ -159,7 +160,8 @@ def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:
 
 def _numbers(names: tuple[str, ...]) -> Float[np.ndarray, " n"]:
     """The last number in each name; 0 without one."""
-    return np.array([(0, *numbers_in(name))[-1] for name in names], dtype=np.float64)
+    numbers = re.compile(number_pattern(names))
+    return np.array([float(("0", *numbers.findall(name))[-1]) for name in names])
 
 
 def rate_of(sequence: Sequence) -> float | None:

@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -85,14 +86,19 @@ def files_in(
     contents: Contents, names: Iterable[str], suffixes: tuple[str, ...]
 ) -> dict[str, Path]:
     """The files of the first existing sub-folder of `names`, by name without suffix, sorted by the
-    numbers in the names; empty if no sub-folder exists."""
+    numbers in the names; empty if no sub-folder exists.
+
+    Of files that differ in their suffix alone, that of the last of `suffixes` counts.
+    """
     for name in names:
         if name in contents.folders:
             folder = contents.folder / name
             inside = list_folder(folder)  # reading them reports faults of other entries
             found = (os.path.splitext(file) for file in inside.files | inside.others)
             chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
-            return {stem: folder / (stem + end) for stem, end in sorted(chosen, key=_natural)}
+            numbers = number_pattern([stem for stem, _ in chosen])
+            chosen.sort(key=lambda one: (_natural(one[0], numbers), suffixes.index(one[1].lower())))
+            return {stem: folder / (stem + end) for stem, end in chosen}
     return {}
 
 
@@ -191,7 +197,20 @@ def with_colors_by_time(
     return [paths[i] if i >= 0 else None for i in index], delays
 
 
-def _natural(item: tuple[str, str]) -> list[str | int]:
+def number_pattern(names: Iterable[str]) -> str:
+    """A regular expression for the numbers in names, which are decimal in `9.96`, `9.98`, `10.0`,
+    `10.02`, and whole in `run1.9`, `run1.10`.
+
+    In decimal numbers without zeros at their ends, digits after the point may begin with 0, which
+    they never do in whole numbers without zeros in front.
+    """
+    parts = [digits for name in names for digits in re.findall(r"\d\.(\d\d+)", name)]
+    is_decimal = any(digits.startswith("0") for digits in parts)
+    is_decimal &= not any(digits.endswith("0") for digits in parts)
+    return r"\d+(?:\.\d+)?" if is_decimal else r"\d+"
+
+
+def _natural(name: str, numbers: str) -> list[str | Decimal]:
     """Sorting key of a name: its numbers are compared as numbers, other text as text."""
-    words = re.split(r"(\d+)", "".join(item))
-    return [int(word) if i % 2 else word for i, word in enumerate(words)]
+    words = re.split(f"({numbers})", name)
+    return [Decimal(word) if i % 2 else word for i, word in enumerate(words)]

@@ -25,6 +25,7 @@ from recordings import (
 )
 
 from jaxshape.data.sequences import LAYOUTS, SequenceError, open_sequence
+from jaxshape.data.sequences.figures import gaps_of
 
 SEEN = record()
 
@@ -282,6 +283,31 @@ def test_frames_are_counted_not_spelt(tmp_path):
     for i in (1, 2, 10, 100):
         save(tmp_path / f"depth/{i}.png", raw(SEEN.depth[0], 1000))
     assert open_sequence(tmp_path).names == ("1", "2", "10", "100")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "9.9 9.933333 9.966667 10.0 10.033333 10.066667 10.1 10.133333",  # no zeros at their ends
+        "9.90 9.93 9.96 10.00 10.03",
+        "run1.9 run1.10 run1.11 run1.100",
+        "run1.0008 run1.0009 run1.0010 run1.0011",
+    ],
+)
+def test_times_and_numbers_after_a_point_are_in_order(tmp_path, names):
+    for name in names.split():
+        save(tmp_path / f"depth/{name}.png", raw(SEEN.depth[0], 1000))
+    sequence = open_sequence(tmp_path)
+    assert sequence.names == tuple(names.split())
+    assert names.startswith("run1.9") or not gaps_of(sequence)
+
+
+def test_of_a_measurement_and_its_picture_the_measurement_is_read(tmp_path):
+    write_bundlesdf(tmp_path, SEEN)
+    for i, depth in enumerate(SEEN.depth):
+        save(tmp_path / f"depth/{i:05d}.png", raw(depth, 50).astype(np.uint8))
+        np.save(tmp_path / f"depth/{i:05d}.npy", depth)
+    np.testing.assert_allclose(open_sequence(tmp_path)[2].depth, SEEN.depth[2], rtol=1e-6)
 
 
 def test_a_folder_that_fits_nothing_says_what_would(tmp_path):
