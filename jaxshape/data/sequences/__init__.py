@@ -111,7 +111,7 @@ def open_sequence(
 
     Args:
         path: Folder of the recording, or an `.npz` file of arrays.
-        depth_scale: Depth units per metre, above 0; None for the scale of the layout.
+        depth_scale: Depth units per metre, above 0; None for that of the files or the layout.
         layout: Name of the layout, a key of `LAYOUTS`; None for the first that fits.
 
     Returns:
@@ -125,14 +125,15 @@ def open_sequence(
     listed = LAYOUTS[name].list_frames(contents)
     if not listed.files:
         raise SequenceError(_nothing_fits(contents))
-    scale = float(listed.depth_scale if depth_scale is None else depth_scale)
+    shape = _shape_of(listed)
+    camera, cameras, doubts = _cameras(contents, listed, shape)
+    scales = (depth_scale, camera.depth_scale, listed.depth_scale)
+    scale = float(next(one for one in scales if one is not None))
     if not 1e-9 < scale < 1e9:
         raise SequenceError(
             f"The depth scale is {scale:g}; expected the number of depth units in a metre, which "
             "is positive: 1000 for millimetres."
         )
-    shape = _shape_of(listed)
-    camera, cameras, doubts = _cameras(contents, listed, shape)
     has_poses, is_guess = listed.read_pose is not None, bool(doubts)
     is_default = listed.camera is not None and camera.source == listed.camera.source
     doubts += (

@@ -29,10 +29,12 @@ class Camera(NamedTuple):
     Attributes:
         intrinsics: Camera matrix, in pixels.
         source: Source of the intrinsics.
+        depth_scale: Depth units per metre that the source states; None if it does not.
     """
 
     intrinsics: Float[np.ndarray, "3 3"]
     source: str
+    depth_scale: float | None = None
 
 
 class Calibration(NamedTuple):
@@ -81,8 +83,8 @@ def find_camera(folder: Path, names: Iterable[str], shape: tuple[int, int]) -> C
         if name in _FILES:
             return _camera(_FILES[name](folder / name), folder / name, shape)
         if re.search(r"(camera|intrinsic|traj).*\.json$", name, re.IGNORECASE):
-            if (intrinsics := _read_json(folder / name, shape)) is not None:
-                return _camera(intrinsics, folder / name, shape)
+            if (camera := _read_json(folder / name, shape)) is not None:
+                return camera
     for name, read in _FILES.items():
         if (path := folder.resolve().parent / name).is_file():
             return _camera(read(path), path, shape)
@@ -175,8 +177,9 @@ _FILES: dict[str, Callable[[Path], Matrix]] = {
 }
 
 
-def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
-    """Open3D's PinholeCameraIntrinsic, or the first of a trajectory; None if it is neither."""
+def _read_json(path: Path, shape: tuple[int, int]) -> Camera | None:
+    """Open3D's PinholeCameraIntrinsic, of a film perhaps with a depth scale, or the first of a
+    trajectory; None if it is neither."""
     try:
         content = reading.read_json(path)
         if "parameters" in content:
@@ -185,6 +188,10 @@ def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
             return None
         K = reading.numbers_of(content["intrinsic_matrix"], (3, 3)).T
         height, width = content.get("height", shape[0]), content.get("width", shape[1])
+        scale = content.get("depth_scale")
+        scale = None if scale is None else float(reading.numbers_of(scale, ()))
+        if scale is not None and not scale > 0:
+            raise ValueError(f"its depth_scale is {scale:g}, not above 0")
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise SequenceError(
             f"{path} cannot be read as a camera ({type(error).__name__}: {error}); expected "
@@ -197,7 +204,8 @@ def _read_json(path: Path, shape: tuple[int, int]) -> Matrix | None:
             "expected the camera of the depth images: write that one."
         )
     K[:2, 2] += 0.5
-    return _scaled(K, (height, width), shape)
+    camera = _camera(_scaled(K, (height, width), shape), path, shape)
+    return camera._replace(depth_scale=scale)
 
 
 def _scaled(

@@ -80,6 +80,20 @@ def test_a_depth_scale_of_ones_own(tmp_path, name):
     assert open_sequence(tmp_path).depth_scale == (5000 if name == "tum" else 1000)
 
 
+def test_a_depth_scale_in_the_file_of_the_camera(tmp_path):
+    write_open3d(tmp_path, SEEN, scale=4000)
+    path = tmp_path / "camera_primesense.json"
+    about = json.loads(path.read_text())
+    path.unlink()
+    (tmp_path / "intrinsic.json").write_text(json.dumps(about | {"depth_scale": 4000.0}))
+    sequence = open_sequence(tmp_path)
+    assert sequence.depth_scale == 4000
+    np.testing.assert_allclose(sequence[1].depth, SEEN.depth[1], rtol=1e-6)
+    assert open_sequence(tmp_path, depth_scale=1000.0).depth_scale == 1000
+    (tmp_path / "intrinsic.json").write_text(json.dumps(about | {"depth_scale": 0}))
+    assert "intrinsic.json cannot be read as a camera" in fault_of(tmp_path)
+
+
 def test_a_layout_can_be_asked_for(tmp_path):
     write_redwood(tmp_path, SEEN)
     assert open_sequence(tmp_path, layout="bundlesdf").layout == "bundlesdf"
