@@ -17,7 +17,9 @@ from jaxshape.data.sequences.poses import NEAR
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".npy", ".exr")
 COLOR_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".ppm")
 
-DEPTH_FOLDERS = ("depth", "depths", "Depth", "aligned_depth_to_color")
+DEPTH_FOLDERS = ("aligned_depth_to_color", "depth", "depths", "Depth")
+"""The first one counts: beside aligned images, those in `depth` are not registered to colour."""
+
 COLOR_FOLDERS = ("color", "image", "rgb", "colors", "images", "Color", "RGB")
 
 

@@ -316,6 +316,14 @@ def test_times_and_numbers_after_a_point_are_in_order(tmp_path, names):
     assert names.startswith("run1.9") or not gaps_of(sequence)
 
 
+def test_depth_that_is_aligned_to_colour_is_preferred(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    shutil.copytree(tmp_path / "depth", tmp_path / "aligned_depth_to_color")
+    for path in (tmp_path / "depth").iterdir():
+        save(path, np.full((H, W), 900, np.uint16))
+    np.testing.assert_allclose(open_sequence(tmp_path)[2].depth, SEEN.depth[2], rtol=1e-6)
+
+
 def test_of_a_measurement_and_its_picture_the_measurement_is_read(tmp_path):
     write_bundlesdf(tmp_path, SEEN)
     for i, depth in enumerate(SEEN.depth):
