@@ -26,7 +26,7 @@ from jaxshape.data.sequences.frames import (
 from jaxshape.data.sequences.hypotheses import Reading, reading_of
 
 _USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; outside, a scale is doubted, not refused
-
+_SLOW = 0.2  # depth images per second; below, times are hardly in seconds
 
 BADLY = 0.5
 """Agreement of poses and depth images below which a reconstruction must fail."""
@@ -84,7 +84,7 @@ def inspect_sequence(
         sequence = read_as(sequence, used)
     is_used = used is not None
     poses = None if reading is None else poses_of(sequence, reading)._replace(is_used=is_used)
-    gaps = gaps_of(sequence)
+    gaps, rate = gaps_of(sequence), rate_of(sequence)
     warnings = [
         *sequence.findings,
         *_of_images(depths, damaged_pictures(sequence)),
@@ -93,6 +93,7 @@ def inspect_sequence(
         *_of_convention(reading, is_used),
         *_of_missing(poses, len(sequence)),
         *_of_gaps(gaps),
+        *_of_rate(rate),
         *_of_delays(sequence),
     ]
     return Inspection(
@@ -102,7 +103,7 @@ def inspect_sequence(
         colors=sum(files.color is not None for files in sequence.files),
         masks=sum(files.mask is not None for files in sequence.files),
         gaps=gaps,
-        rate=rate_of(sequence),
+        rate=rate,
         warnings=tuple(warnings),
     )
 
@@ -241,6 +242,15 @@ def _of_gaps(gaps: tuple[Gap, ...]) -> Iterator[Finding]:
             f"missing frames: {sum(gap.missing for gap in gaps)}, the most ({worst.missing}) "
             f"between {worst.after} and {worst.before}",
             "Tracking may lose the camera there; given poses bridge it.",
+        )
+
+
+def _of_rate(rate: float | None) -> Iterator[Finding]:
+    if rate is not None and rate < _SLOW:
+        yield Finding(
+            f"the usual time between two depth images is {1 / rate:.3g} s",
+            "Times are expected in seconds, of images and poses alike: divide milliseconds by "
+            "1000, and nanoseconds by 1e9.",
         )
 
 

@@ -165,3 +165,13 @@ def test_colours_of_other_times_and_without_depth(tmp_path):
     assert any(
         "8 of 12 depth images have no colour" in warning for warning in warnings_of(tmp_path)
     )
+
+
+@pytest.mark.parametrize("per_second, said", [(1e3, "33 s"), (1e9, "3.33e+07 s")])
+def test_times_in_other_units_than_seconds(tmp_path, per_second, said):
+    write_tum(tmp_path, SEEN)
+    for name in ("depth.txt", "rgb.txt", "groundtruth.txt"):
+        lines = [line.split(" ", 1) for line in (tmp_path / name).read_text().splitlines()]
+        text = [f"{float(t) * per_second:.0f} {rest}" for t, rest in lines if t != "#"]
+        (tmp_path / name).write_text("\n".join(text))
+    assert any(f"two depth images is {said}" in warning for warning in warnings_of(tmp_path))
