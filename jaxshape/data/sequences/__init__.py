@@ -248,7 +248,8 @@ def _cameras(
 def _camera(
     contents: Contents, listed: Listed, shape: tuple[int, int]
 ) -> tuple[Camera, tuple[Finding, ...]]:
-    camera = find_camera(contents.folder, contents.files, shape)
+    beside = list_folder(contents.folder).files  # also beside a file that is a recording by itself
+    camera = find_camera(contents.folder, beside, shape)
     if camera is not None:
         return camera, ()
     if listed.camera is None:

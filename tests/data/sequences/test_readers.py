@@ -320,6 +320,20 @@ def test_an_npz_file_can_be_given_itself(tmp_path):
     assert "holds no recording" in fault_of(tmp_path)
 
 
+def test_the_camera_of_arrays_may_lie_beside_them(tmp_path):
+    np.savez(tmp_path / "scan.npz", depth=SEEN.depth)
+    assert f"expected the 3x3 camera matrix in {tmp_path}" in fault_of(tmp_path / "scan.npz")
+    np.savetxt(tmp_path / "cam_K.txt", OPENCV)
+    np.testing.assert_allclose(open_sequence(tmp_path / "scan.npz").intrinsics, SEEN.K[0])
+
+
+def test_arrays_that_may_be_poses_are_named(tmp_path):
+    path = tmp_path / "scan.npz"
+    np.savez(path, depth=SEEN.depth, K=OPENCV, extrinsics=SEEN.T_world_camera, gain=1)
+    (remark,) = open_sequence(path).findings
+    assert "scan.npz holds extrinsics, which are not read" in remark.evidence
+
+
 def test_arrays_that_do_not_fit_are_named(tmp_path):
     path = tmp_path / "scan.npz"
     for arrays, word in (

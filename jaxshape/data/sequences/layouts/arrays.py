@@ -1,12 +1,13 @@
 """A single `.npz` file of arrays: depth, and optionally colour, cameras, poses, masks and times."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from jaxshape import reading
 from jaxshape.data.sequences.cameras import Calibration
-from jaxshape.data.sequences.frames import FrameFiles, SequenceError
+from jaxshape.data.sequences.frames import Finding, FrameFiles, SequenceError
 from jaxshape.data.sequences.listing import Contents, Listed
 from jaxshape.data.sequences.poses import known
 from jaxshape.data.sequences.rasters import Stored
@@ -19,6 +20,8 @@ _NAMES = {
     "masks": ("masks", "mask"),
     "times": ("times", "timestamps"),
 }
+
+_POSES = re.compile("pose|extrinsic|traj|w2c|c2w|cam", re.IGNORECASE)
 
 
 def fits(contents: Contents) -> bool:
@@ -71,6 +74,21 @@ def list_frames(contents: Contents) -> Listed:
         read_pose=None if poses is None else lambda i: known(poses[i], f"{path}: pose {i}"),
         times=times if times is not None and _rises(times) else None,
         calibration=None if K is None else _calibration(K, path),
+        findings=_without_poses(path) if poses is None else (),
+    )
+
+
+def _without_poses(path: Path) -> tuple[Finding, ...]:
+    """A remark on arrays that may be poses, in a file without poses."""
+    others = sorted(filter(_POSES.search, reading.array_names(path)))
+    if not others:
+        return ()
+    return (
+        Finding(
+            f"{path.name} holds {', '.join(others[:4])}, which are not read",
+            "If they are poses, save them camera to world as poses [n 4 4]; otherwise the camera "
+            "is tracked.",
+        ),
     )
 
 
