@@ -2,6 +2,7 @@
 time."""
 
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -34,13 +35,17 @@ class StoredByColumns(SequenceError):
 def read_matrix(path: Path, size: int) -> Float[np.ndarray, "n n"]:
     """Read a square matrix of `size` rows; `SequenceError` if the file has another form.
 
-    Comments and commas are ignored.
+    Comments and commas are ignored. All numbers may stand in one line, and a pose may lack its last
+    row, 0 0 0 1.
     """
     try:
         rows = [[number(word) for word in words] for _, words in words_of(reading.read_text(path))]
-        if [len(row) for row in rows] != [size] * size:
-            raise ValueError(f"its lines hold {[len(row) for row in rows]} numbers")
-        matrix = np.array(rows, dtype=np.float64)
+        counts = [len(row) for row in rows]
+        is_short = size == 4 and counts in ([4] * 3, [12])
+        if not is_short and counts not in ([size] * size, [size**2]):
+            raise ValueError(f"its lines hold {counts} numbers")
+        numbers = [*chain(*rows), *[0, 0, 0, 1] * is_short]
+        matrix = np.array(numbers, dtype=np.float64).reshape(size, size)
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} is not a matrix ({error}); expected {size} lines of {size} numbers: write it "

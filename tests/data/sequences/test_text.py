@@ -26,6 +26,9 @@ PLAIN = "1 0 0 2\n0 1 0 3\n0 0 1 -4.5\n0 0 0 1\n"
         PLAIN.replace(" ", ", ").encode(),
         ("# camera to world\n\n" + PLAIN.replace("\n", " // a row\n")).encode(),
         PLAIN.replace(" ", ",").replace("\n", "],\n[").rstrip("[").encode(),
+        PLAIN.replace("\n", " ").encode(),
+        PLAIN.removesuffix("0 0 0 1\n").encode(),
+        PLAIN.removesuffix("0 0 0 1\n").replace("\n", " ").encode(),
     ],
 )
 def test_a_matrix_however_it_is_written(tmp_path, content):
