@@ -157,6 +157,8 @@ def _read_log(text: str) -> Trajectory:
     T = np.array(
         [[[number(w) for w in row] for row in words[i + 1 : i + 5]] for i in _fifth(words)]
     )
+    if len(T) and T.shape[1:] != (4, 4):
+        raise ValueError(f"its matrices are {T.shape[1]} x {T.shape[2]}, not 4 x 4")
     frames = np.array([int(words[i][0]) for i in _fifth(words)], dtype=int)
     if (np.diff(frames) <= 0).any():  # not indices of frames, but e.g. of fragments
         frames = np.arange(len(frames))

@@ -128,6 +128,7 @@ def test_a_tum_file_without_times_counts_frames(tmp_path):
         ("a.txt", "1 0 0 0 0 0 0 0\n", "quaternion of length 0"),
         ("a.log", "0 0 1\n1 0 0 0\n", "2 lines, not five"),
         ("a.log", "0 0 1\n2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n", "Pose 0 of .* orthonormal"),
+        ("a.log", "0 0 1\n" + "1 0 0 0 0 0 0 0\n" * 4, "4 x 8, not 4 x 4"),
         ("a.json", "{}", "KeyError"),
         ("a.json", '{"parameters": [{"extrinsic": [1, 2]}]}', "cannot be read as a trajectory"),
     ],
