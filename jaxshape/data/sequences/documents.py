@@ -84,12 +84,13 @@ def below(folder: Path, name: Any, source: Path) -> Path:
     """The file that a text names, which must be below the folder of the recording.
 
     Links are resolved first, so that a recording cannot make the reader open files outside it.
+    Backslashes, which programs on Windows write, count as slashes.
     """
     if not isinstance(name, str) or "\0" in name or len(name) > limits.PATH_LENGTH:
         raise SequenceError(
             f"{source} names the file {str(name)[:60]!r}; expected a path, relative to it."
         )
-    path = folder / name
+    path = folder / name.replace("\\", "/")
     try:
         is_below = path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # a name that is too long, or links in a circle

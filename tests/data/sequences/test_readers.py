@@ -286,7 +286,9 @@ def test_an_angle_of_view_and_images_without_suffix(tmp_path):
     np.testing.assert_array_equal(frame.color, SEEN.color[2])
 
 
-@pytest.mark.parametrize("name", ["../secret.png", "/etc/hostname", "depth/link.png", 7])
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "..\\secret.png", "/etc/hostname", "depth/link.png", 7]
+)
 def test_files_outside_of_the_recording_are_not_opened(tmp_path, name):
     folder = tmp_path / "recording"
     folder.mkdir()

@@ -56,6 +56,16 @@ def test_a_trajectory_of_utf_16_with_commas(tmp_path):
     np.testing.assert_allclose(way.T_world_camera, SEEN.T_world_camera, atol=1e-9)
 
 
+def test_a_list_of_windows_is_read(tmp_path):
+    write_tum(tmp_path, SEEN)
+    for name in ("depth.txt", "rgb.txt"):
+        text = (tmp_path / name).read_text().replace("/", "\\").replace("\n", "\r\n")
+        (tmp_path / name).write_bytes(text.encode())
+    frame = open_sequence(tmp_path)[2]
+    np.testing.assert_allclose(frame.depth, SEEN.depth[2], rtol=1e-6)
+    np.testing.assert_array_equal(frame.color, SEEN.color[2])
+
+
 def test_times_that_do_not_rise(tmp_path):
     write_tum(tmp_path, SEEN)
     lines = (tmp_path / "depth.txt").read_text().splitlines()
