@@ -211,6 +211,15 @@ def test_without_a_world_the_object_of_most_images_is_the_world(tmp_path):
     np.testing.assert_array_equal(sequence[3].mask, SEEN.mask[3])
 
 
+def test_depth_images_that_the_scene_does_not_name_are_left_out_and_counted(tmp_path):
+    write_bop(tmp_path, SEEN)
+    about = json.loads((tmp_path / "scene_camera.json").read_text())
+    (tmp_path / "scene_camera.json").write_text(json.dumps({k: about[k] for k in "135"}))
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == 3
+    assert sequence.findings[1].evidence == "2 depth images are not in scene_camera.json"
+
+
 def test_depth_is_in_the_unit_of_the_scene(tmp_path):
     write_bop(tmp_path, SEEN, unit=1.0)
     assert open_sequence(tmp_path).depth_scale == 1000

@@ -37,7 +37,8 @@ def list_frames(contents: Contents) -> Listed:
     """
     source = contents.folder / "scene_camera.json"
     about = read_json_object(source)
-    depth = {name: path for name, path in depth_images(contents).items() if _key(name) in about}
+    every = depth_images(contents)
+    depth = {name: path for name, path in every.items() if _key(name) in about}
     if not depth:
         raise SequenceError(f"{source} names none of the depth images; copy it again.")
     images = [about[_key(name)] for name in depth]
@@ -52,8 +53,15 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=_depth_scale(images, source),
         read_pose=_poses(images, [truth.get(_key(name), []) for name in depth], instance, source),
         calibration=Calibration(_cameras(images, source), None, source.name),
-        findings=findings,
+        findings=(*findings, *_left_out(len(every) - len(depth), source)),
     )
+
+
+def _left_out(count: int, source: Path) -> tuple[Finding, ...]:
+    if not count:
+        return ()
+    advice = "They are left out; copy the file again, if it should name them."
+    return (Finding(f"{count} depth images are not in {source.name}", advice),)
 
 
 def _key(name: str) -> str:
