@@ -316,8 +316,18 @@ def read_instances(path: Picture, shape: tuple[int, int]) -> Int[np.ndarray, "h 
 def _mask_pixels(path: Picture, shape: tuple[int, int]) -> np.ndarray:
     with opened(path) as image:
         _check_aspect(image, shape, path)
-        opaque = image.convert("RGB") if image.mode in ("LA", "RGBA") else image
+        opaque = image.convert("RGB") if _is_painted(image) else image
         return np.array(opaque.resize((shape[1], shape[0]), Image.Resampling.NEAREST))
+
+
+def _is_painted(image: Image.Image) -> bool:
+    """Whether only the colours of an image tell what is black, and not its numbers: it has opacity,
+    or a palette in which black is not the first colour."""
+    if image.mode != "P":
+        return image.mode in ("LA", "RGBA")
+    palette = image.getpalette() or []
+    used = [palette[3 * i : 3 * i + 3] for i in np.unique(np.array(image)).tolist()]
+    return palette[:3] != [0, 0, 0] and [0, 0, 0] in used
 
 
 def _check_aspect(image: Image.Image, shape: tuple[int, int], path: Picture) -> None:

@@ -268,6 +268,18 @@ def test_colour_and_mask_of_twice_the_size_are_scaled(tmp_path):
     np.testing.assert_array_equal(frame.color[:, W // 2 + 1 :], 200)
 
 
+def test_a_mask_with_a_palette_is_what_is_not_black(tmp_path):
+    write_bundlesdf(tmp_path, SEEN)
+    mask = np.zeros((H, W), bool)
+    mask[10:30, 10:30] = True
+    for i, palette in enumerate(([0, 0, 0, 9, 9, 9], [255, 255, 255, 0, 0, 0], [7, 7, 7, 9, 9, 9])):
+        image = Image.fromarray((mask ^ (i == 1)).astype(np.uint8)).convert("P")
+        image.putpalette(palette)
+        image.save(tmp_path / f"masks/{i:05d}.png")
+    for frame in list(open_sequence(tmp_path))[:3]:
+        np.testing.assert_array_equal(frame.mask, mask)
+
+
 def test_colours_of_another_aspect_are_left_out_and_said(tmp_path):
     seen = SEEN._replace(color=np.zeros((6, 72, 128, 3), np.uint8))
     write_bundlesdf(tmp_path, seen)
