@@ -295,6 +295,18 @@ def test_an_angle_of_view_and_images_without_suffix(tmp_path):
     np.testing.assert_array_equal(frame.color, SEEN.color[2])
 
 
+def test_instant_ngp_has_its_own_names_of_depth_and_its_unit(tmp_path):
+    write_nerfstudio(tmp_path, SEEN)
+    about = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in about["frames"]:
+        frame["depth_path"] = frame.pop("depth_file_path").replace("depth", "deep")
+    (tmp_path / "depth").rename(tmp_path / "deep")
+    for i, depth in enumerate(SEEN.depth):
+        save(tmp_path / f"deep/frame_{i + 1:05d}.png", raw(depth, 4000))
+    edit(tmp_path, frames=about["frames"], integer_depth_scale=1 / 4000)
+    np.testing.assert_allclose(open_sequence(tmp_path)[2].depth, SEEN.depth[2], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     "name", ["../secret.png", "..\\secret.png", "/etc/hostname", "depth/link.png", 7]
 )

@@ -1,4 +1,5 @@
-"""nerfstudio, and Polycam through it: `transforms.json` with a camera and a pose for each image."""
+"""nerfstudio, Polycam through it, and instant-ngp: `transforms.json` with a camera and a pose for
+each image."""
 
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from jaxshape.data.sequences.poses import from_opengl, known
 
 _SOURCE = "transforms.json"
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
 _CAMERA = ("h", "w", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
 
 
@@ -36,7 +38,8 @@ def fits(contents: Contents) -> bool:
 
 
 def list_frames(contents: Contents) -> Listed:
-    """`transforms.json`, and the images it names: `file_path`, `depth_file_path`, `mask_path`.
+    """`transforms.json`, and the images it names: `file_path`, `depth_file_path`, `mask_path`;
+    instant-ngp's `depth_path`.
 
     Poses are camera to world with OpenGL's axes, y up and z backwards; pixel coordinates start at
     the corner of the image, like ours. Frames are sorted by the names of their images.
@@ -93,8 +96,8 @@ def _order(frame: dict[str, Any]) -> tuple[tuple[int, ...], str]:
 
 def _depth_of(contents: Contents, frames: list[dict[str, Any]], source: Path) -> list[Path | None]:
     """The depth image of each frame: the named one, or the one with the same name or number."""
-    if any(frame.get("depth_file_path") for frame in frames):
-        named = [frame.get("depth_file_path") for frame in frames]
+    named = [frame.get("depth_file_path") or frame.get("depth_path") for frame in frames]
+    if any(named):
         return [below(contents.folder, name, source) if name else None for name in named]
     if not has_depth_folder(contents):
         return [None] * len(frames)
@@ -114,12 +117,13 @@ def _files(folder: Path, frame: dict[str, Any], depth: Path | None, source: Path
 
 
 def _depth_scale(about: dict[str, Any], files: list[FrameFiles], source: Path) -> float:
-    if (unit := about.get("depth_unit_scale_factor")) is None:
+    unit = next((name for name in _UNITS if about.get(name) is not None), None)
+    if unit is None:
         return usual_depth_scale(one.depth for one in files)
-    metres = float(matrix_of(unit, (), source, "depth_unit_scale_factor"))
+    metres = float(matrix_of(about[unit], (), source, unit))
     if not (np.isfinite(metres) and metres > 0):
         raise SequenceError(
-            f"{source} gives depth_unit_scale_factor {metres:g}; expected the metres in a unit of "
+            f"{source} gives {unit} {metres:g}; expected the metres in a unit of "
             "depth, which are positive: 0.001 for millimetres."
         )
     return 1 / metres
