@@ -27,6 +27,7 @@ from jaxshape.data.sequences.cameras import (
     default_camera,
     find_camera,
     guessed,
+    other_cameras,
     scaled_cameras,
 )
 from jaxshape.data.sequences.frames import Finding as Finding
@@ -137,6 +138,7 @@ def open_sequence(
     has_poses, is_guess = listed.read_pose is not None, bool(doubts)
     is_default = listed.camera is not None and camera.source == listed.camera.source
     doubts += (
+        *other_cameras(camera, contents.folder, contents.files, shape),
         *unmatched(contents, listed),
         *unread(contents, has_poses=has_poses, has_camera=not is_default, earlier=listed.findings),
     )

@@ -7,7 +7,8 @@ principal points.
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,18 +78,53 @@ def find_camera(folder: Path, names: Iterable[str], shape: tuple[int, int]) -> C
 
     It may be `camera-intrinsics.txt` or `cam_K.txt` (3x3), `calibration.txt` (fx fy cx cy), or a
     camera or trajectory of Open3D with "camera", "intrinsic" or "traj" in its name, which is scaled
-    to `shape` if its size differs.
+    to `shape` if its size differs. The first of them counts; of Open3D's, one of the depth images.
     """
-    for name in sorted(names, key=lambda name: ("traj" in name, name)):
-        if name in _FILES:
-            return _camera(_FILES[name](folder / name), folder / name, shape)
-        if re.search(r"(camera|intrinsic|traj).*\.json$", name, re.IGNORECASE):
-            if (camera := _read_json(folder / name, shape)) is not None:
-                return camera
-    for name, read in _FILES.items():
+    for name in _camera_files(names):
+        if (camera := _read_camera(folder / name, shape)) is not None:
+            return camera
+    for name in _FILES:
         if (path := folder.resolve().parent / name).is_file():
-            return _camera(read(path), path, shape)
+            return _read_camera(path, shape)
     return None
+
+
+def other_cameras(
+    camera: Camera, folder: Path, names: Iterable[str], shape: tuple[int, int]
+) -> Iterator[Finding]:
+    """Remarks on camera files in a folder with the files `names` that differ from `camera`.
+
+    Args:
+        camera: The camera that is used.
+        folder: Folder of the recording.
+        names: Names of its files.
+        shape: Height and width of the depth images, in pixels.
+    """
+    for name in _camera_files(names):
+        with suppress(SequenceError):  # it may be of other images
+            other = _read_camera(folder / name, shape)
+            # The same numbers may be meant from the corner or from the centre of a pixel.
+            if other and not np.allclose(other.intrinsics, camera.intrinsics, rtol=0.01, atol=1):
+                yield Finding(
+                    f"{name} gives other intrinsics than {camera.source}, which are used",
+                    "Remove the file that is not of the depth images.",
+                )
+
+
+def _camera_files(names: Iterable[str]) -> list[str]:
+    """The names of camera files, by precedence."""
+    names = frozenset(names)
+    pattern = re.compile(r"(camera|intrinsic|traj).*\.json$", re.IGNORECASE)
+    found = sorted(filter(pattern.search, names))
+    found.sort(key=lambda name: ("traj" in name, "depth" not in name))
+    return [*(name for name in _FILES if name in names), *found]
+
+
+def _read_camera(path: Path, shape: tuple[int, int]) -> Camera | None:
+    """A camera file, checked; None if it is a JSON file of something else."""
+    if path.name in _FILES:
+        return _camera(_FILES[path.name](path), path, shape)
+    return _read_json(path, shape)
 
 
 def _camera(K: Matrix, path: Path, shape: tuple[int, int]) -> Camera:

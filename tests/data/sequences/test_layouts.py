@@ -437,6 +437,22 @@ def test_damaged_cameras(tmp_path, camera, said):
     assert said in fault_of(tmp_path)
 
 
+def test_one_camera_of_several_is_used_and_the_others_are_named(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    path = tmp_path / "camera_primesense.json"
+    about = json.loads(path.read_text())
+    path.rename(tmp_path / "depth_intrinsic.json")
+    about["intrinsic_matrix"][0] *= 1.3
+    (tmp_path / "color_intrinsic.json").write_text(json.dumps(about))
+    (tmp_path / "camera.json").write_text('{"width": 9, "height": 9, "intrinsic_matrix": [1]}')
+    sequence = open_sequence(tmp_path)
+    np.testing.assert_allclose(sequence.intrinsics, K)
+    said = "color_intrinsic.json gives other intrinsics than depth_intrinsic.json, which are used"
+    assert [remark.evidence for remark in sequence.findings] == [said]
+    np.savetxt(tmp_path / "cam_K.txt", K)
+    assert open_sequence(tmp_path).camera == "cam_K.txt"
+
+
 def test_a_camera_that_is_guessed_is_a_finding_and_must_have_the_aspect(tmp_path):
     write_open3d(tmp_path, SEEN)
     (tmp_path / "camera_primesense.json").unlink()
