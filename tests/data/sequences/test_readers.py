@@ -178,6 +178,13 @@ def test_poses_of_replica_stay_with_their_images_when_some_are_removed(tmp_path)
         np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-9)
 
 
+def test_matrices_of_replica_may_have_a_header_and_commas(tmp_path):
+    write_replica(tmp_path, SEEN)
+    path = tmp_path / "traj.txt"
+    path.write_text("# camera to world\n\n" + path.read_text().replace(" ", ", "))
+    np.testing.assert_allclose(open_sequence(tmp_path)[4].T_world_camera, SEEN.T_world_camera[4])
+
+
 def test_replica_of_semantic_nerf_is_in_millimetres(tmp_path):
     for i, depth in enumerate(SEEN.depth):
         save(tmp_path / f"depth/depth_{i}.png", raw(depth, 1000))

@@ -29,6 +29,7 @@ from jaxshape.data.sequences.listing import (
     partners,
 )
 from jaxshape.data.sequences.poses import known
+from jaxshape.data.sequences.text import words_of
 
 _SCALES = {"traj.txt": 6553.5, "traj_w_c.txt": 1000.0}
 """Depth units per metre by the name of the poses: of NICE-SLAM, and of Semantic-NeRF and vMAP."""
@@ -51,7 +52,8 @@ def _poses(contents: Contents) -> Path | None:
 
 def _is_matrices(path: Path) -> bool:
     """Whether a file has 16 numbers on its first line, unlike a trajectory of TUM."""
-    return len(read_document(path).lstrip().split("\n", 1)[0].split()) == 16
+    _, first = next(iter(words_of(read_document(path))), (0, []))
+    return len(first) == 16
 
 
 def list_frames(contents: Contents) -> Listed:
