@@ -145,6 +145,25 @@ def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | 
     return [offered.get(name) or by_number.get(numbers_in(name)) for name in wanted]
 
 
+def miscounted_poses(found: list[Path | None], offered: int) -> tuple[Finding, ...]:
+    """A remark if depth images have no pose although there are enough of them.
+
+    Args:
+        found: File of the pose of each depth image; None for none.
+        offered: Number of files of poses.
+    """
+    if None not in found or offered < len(found):
+        return ()
+    return (
+        Finding(
+            f"{found.count(None)} of {len(found)} depth images have no pose of their number, "
+            f"although there are {offered} poses",
+            "Give poses the numbers of their images: if one kind is counted from 0 and the other "
+            "from 1, all poses are a frame late.",
+        ),
+    )
+
+
 def last_number(name: str) -> int:
     """The last number in a name; -1 if it has none."""
     return (-1, *numbers_in(name))[-1]

@@ -151,6 +151,16 @@ def test_colours_that_are_counted_from_another_number_are_named(tmp_path, name, 
     assert "there are 5" in remark.evidence and "a frame late" in remark.advice
 
 
+@pytest.mark.parametrize("layout", ["scannet", "open3d"])
+def test_poses_that_are_counted_from_another_number_are_named(tmp_path, layout):
+    write_scannet(tmp_path, SEEN)
+    assert not open_sequence(tmp_path).findings
+    for path in sorted((tmp_path / "pose").iterdir(), reverse=True):
+        path.rename(path.with_stem(str(int(path.stem) + 1)))
+    remark = open_sequence(tmp_path, layout=layout).findings[0]
+    assert "1 of 5 depth images have no pose of their number, although" in remark.evidence
+
+
 # ScanNet, WildRGB-D, Replica -------------------------------------------------------------------
 
 

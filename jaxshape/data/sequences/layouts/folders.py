@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxshape import reading
 from jaxshape.data.sequences.cameras import PRIMESENSE, DefaultCamera
-from jaxshape.data.sequences.frames import SequenceError, usual_depth_scale
+from jaxshape.data.sequences.frames import Finding, SequenceError, usual_depth_scale
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
@@ -18,6 +18,7 @@ from jaxshape.data.sequences.listing import (
     files_in,
     frame_files,
     has_depth_folder,
+    miscounted_poses,
     numbers_in,
     partners,
     with_colors_by_time,
@@ -109,24 +110,28 @@ def list_open3d(contents: Contents) -> Listed:
 
 def _by_name(contents: Contents) -> Listed:
     depth = depth_images(contents)
-    read = _pose_files(contents, list(depth)) or _trajectory_poses(contents, len(depth))
+    read, doubts = _pose_files(contents, list(depth))
     return Listed(
         files=frame_files(contents, depth),
         depth_scale=usual_depth_scale(depth.values()),
-        read_pose=read,
+        read_pose=read or _trajectory_poses(contents, len(depth)),
         camera=DefaultCamera(PRIMESENSE, "Open3D's default, a PrimeSense", sure=False),
+        findings=doubts,
     )
 
 
 # Poses -----------------------------------------------------------------------------------------
 
 
-def _pose_files(contents: Contents, names: list[str]) -> PoseReader | None:
-    """Poses in one file each, with the names or the numbers of the depth images."""
+def _pose_files(
+    contents: Contents, names: list[str]
+) -> tuple[PoseReader | None, tuple[Finding, ...]]:
+    """Poses in one file each, with the names or the numbers of the depth images, and doubts."""
     for folder, is_object_to_camera in _POSE_FOLDERS.items():
         if offered := files_in(contents, (folder,), (".txt",)):
-            return _reader(partners(names, offered), is_object_to_camera)
-    return None
+            found = partners(names, offered)
+            return _reader(found, is_object_to_camera), miscounted_poses(found, len(offered))
+    return None, ()
 
 
 def _reader(files: list[Path | None], is_object_to_camera: bool) -> PoseReader:

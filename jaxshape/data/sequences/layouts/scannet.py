@@ -8,6 +8,7 @@ from jaxshape.data.sequences.listing import (
     files_in,
     frame_files,
     has_depth_folder,
+    miscounted_poses,
     partners,
 )
 from jaxshape.data.sequences.poses import read_matrix, read_pose
@@ -27,7 +28,8 @@ def list_frames(contents: Contents) -> Listed:
     depth images.
     """
     depth = depth_images(contents)
-    poses = partners(depth, files_in(contents, ("pose", "poses"), (".txt",)))
+    offered = files_in(contents, ("pose", "poses"), (".txt",))
+    poses = partners(depth, offered)
     K = read_matrix(contents.folder / _CAMERA, 4)[:3, :3]
     K[:2, 2] += 0.5  # their coordinates start at the centre of the first pixel
     return Listed(
@@ -35,4 +37,5 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=1000.0,
         read_pose=(lambda index: read_pose(poses[index])) if any(poses) else None,
         calibration=Calibration(K[None], None, _CAMERA),
+        findings=miscounted_poses(poses, len(offered)),
     )
