@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional
 
 from jaxshape.claim import Output
 from jaxshape.cli.common import console, progress_bar, require, warn
-from jaxshape.cli.inspecting import ConventionName
+from jaxshape.cli.opening import Recorded
 from jaxshape.cli.rebuild import Rebuild, draw, report_objective
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct(Rebuild):
+class Reconstruct(Rebuild, Recorded):
     """Rebuild an object from an RGB-D recording: find it, track the camera, map it.
 
     The object is found automatically if it is alone and central, or by a click, a region, a depth
@@ -34,8 +33,6 @@ class Reconstruct(Rebuild):
     jaxshape reconstruct scan/ --list, then jaxshape reconstruct scan/ --object 2
     """
 
-    frames: Positional[Path]
-    """Folder of a recording; `jaxshape inspect` describes its content."""
     click: tuple[float, float] | None = None
     """Column and row of a pixel of the first frame that shows the object."""
     region: tuple[float, float, float, float] | None = None
@@ -52,16 +49,6 @@ class Reconstruct(Rebuild):
     frame of the first camera."""
     poses: Literal["auto", "given", "first", "none"] = "auto"
     """Which of the recorded poses to use: all (auto: if there are any), only the first, or none."""
-    first: int = 0
-    """Number of the first frame, from 0."""
-    every: int = 1
-    """Use every n-th frame, 1 or more."""
-    depth_scale: float | None = None
-    """Depth units per metre, above 0; by default detected, or that of the layout."""
-    convention: tuple[ConventionName, ...] = ()
-    """Conventions in which poses and depth are written; detected by default."""
-    guess_camera: bool = False
-    """If the folder has no camera, use the usual camera of such recordings."""
     tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
     mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
     fresh: bool = False
@@ -69,6 +56,10 @@ class Reconstruct(Rebuild):
     output: Path = Path("out/reconstruct")
     """Folder for mesh.glb, mesh.ply, grid.npz, trajectory.txt, keyframes.json, result.json,
     report.html and more."""
+
+    def __post_init__(self) -> None:
+        Recorded.__post_init__(self)
+        Rebuild.__post_init__(self)
 
     @property
     def writes(self) -> Output:
@@ -92,24 +83,16 @@ class Reconstruct(Rebuild):
         from jaxshape.results.progress import write_progress
         from jaxshape.search.reconstruction import require_measured
 
-        require(self.every >= 1, f"--every is {self.every}; give 1 or more.")
-        require(self.first >= 0, f"--first is {self.first}; give a number that is not negative.")
         prior, refiner, search = self.prepare()
         placer = self.placer(prior)
-        found = opened(
-            self.frames,
-            first=self.first,
-            depth_scale=self.depth_scale,
-            convention=self.convention,
-            guess_camera=self.guess_camera,
-        )
+        found = self.opened()
         sequence = found.sequence
         if self.list_objects:
             return self._list_objects(sequence)
         prompt = Prompt(self.click, self.region, self.depth_range, self.object)
         check_prompt(prompt, sequence.shape)
         box = read_box(self.box) if self.box else None
-        use_poses = poses_used(found, self.frames, self.poses)
+        use_poses = self.uses_poses(found, self.poses)
         mapper = build_mapper(prior, refiner, search, self.mapping, self.tracking, seed=self.seed)
         figures: dict[str, Any] = {
             "object": str(self.frames),
@@ -224,53 +207,3 @@ _SECONDS_BETWEEN_WRITES = 3.0
 
 def _note(progress: Any) -> str:
     return f"{len(progress.state.keyframes)} keyframes"
-
-
-def opened(
-    frames: Path,
-    *,
-    first: int,
-    depth_scale: float | None,
-    convention: tuple[ConventionName, ...],
-    guess_camera: bool,
-) -> Any:
-    """Open and inspect a recording (`Inspection`): how it is to be read, and warnings.
-
-    Refuses a guessed camera unless allowed, and a first frame that does not exist.
-    """
-    from jaxshape.data.sequences import open_sequence
-    from jaxshape.data.sequences.inspection import inspect_sequence
-
-    sequence = open_sequence(frames, depth_scale=depth_scale)
-    with console.status("inspecting the recording"):
-        require(
-            guess_camera or not sequence.camera_is_guess,
-            f"{str(frames)!r} holds no camera, and a focal length that is wrong by 5 % bends "
-            "the surface: write fx 0 cx / 0 fy cy / 0 0 1 to cam_K.txt there, or add "
-            f"--guess-camera to use that of {sequence.camera}.",
-        )
-        keep_scale = depth_scale is not None
-        found = inspect_sequence(sequence, convention or None, keep_scale=keep_scale)
-    count = len(found.sequence)
-    require(first < count, f"--first is {first}, but there are {count} frames, counted from 0.")
-    return found
-
-
-def poses_used(found: Any, frames: Path, poses: str) -> bool:
-    """Whether all given poses are used; refuses options that contradict the recording."""
-    from jaxshape.data.sequences.inspection import BADLY
-
-    has_poses, read = found.sequence.has_poses, found.poses
-    if poses in ("given", "first"):
-        require(has_poses, f"--poses is {poses}, but {str(frames)!r} has none; leave it out.")
-    if poses in ("none", "first") or not has_poses:
-        return False
-    best = read.reading.best
-    hint = "" if best is None else f"with {best.convention.options} it is {best.share:.0%}; "
-    require(
-        read.reading.pairs == 0 or read.agreement >= BADLY,
-        f"The poses in {str(frames)!r} agree with the depth images on "
-        f"{read.agreement:.0%} of the pixels only, and would tear the surface: {hint}"
-        "state how they are written with --convention, or add --poses none to track instead.",
-    )
-    return True

@@ -6,18 +6,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from tyro.conf import Positional
 
 from jaxshape import checks
 from jaxshape.claim import Output
 from jaxshape.cli.common import console, progress_bar, warn
-from jaxshape.cli.inspecting import ConventionName
+from jaxshape.cli.opening import Recorded
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.search.config import RefineConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuildScene:
+class BuildScene(Recorded):
     """Rebuild all objects of a room from an RGB-D recording, each of its own class.
 
     Everything that has the size of furniture and stands on the floor or on a table becomes an
@@ -31,8 +30,6 @@ class BuildScene:
     jaxshape scene room/ --every 5 --poses none
     """
 
-    frames: Positional[Path]
-    """Folder of a recording; `jaxshape inspect` describes its content."""
     prior: dict[str, Path] = field(default_factory=dict)
     """Further classes and their weights, in addition to those of the package: NAME FILE ..."""
     method: str | None = None
@@ -42,25 +39,14 @@ class BuildScene:
     """Seed of all random numbers, 0 or more."""
     poses: Literal["auto", "none"] = "auto"
     """Which of the recorded poses to use: all (auto: if there are any), or none."""
-    first: int = 0
-    """Number of the first frame, from 0."""
-    every: int = 1
-    """Use every n-th frame, 1 or more."""
-    depth_scale: float | None = None
-    """Depth units per metre, above 0; by default detected, or that of the layout."""
-    convention: tuple[ConventionName, ...] = ()
-    """Conventions in which poses and depth are written; detected by default."""
-    guess_camera: bool = False
-    """If the folder has no camera, use the usual camera of such recordings."""
     tracking: tyro.conf.OmitArgPrefixes[TrackingConfig] = TrackingConfig()
     mapping: tyro.conf.OmitArgPrefixes[MappingConfig] = MappingConfig()
     output: Path = Path("out/scene")
     """Folder for scene.glb, scene.json, mesh.ply, objects.png, objects/, report.html and more."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.seed("seed", self.seed)
-        checks.whole("every", self.every, 1)
-        checks.whole("first", self.first, 0)
 
     @property
     def writes(self) -> Output:
@@ -69,7 +55,6 @@ class BuildScene:
 
     def run(self) -> None:
         start = time.perf_counter()
-        from jaxshape.cli.recording import opened, poses_used
         from jaxshape.mapping.scene.classes import build_classes
         from jaxshape.mapping.scene.following import finish_scene, follow_scene
         from jaxshape.model.weights import load_scene_priors
@@ -86,15 +71,9 @@ class BuildScene:
             track=self.tracking,
             seed=self.seed,
         )
-        found = opened(
-            self.frames,
-            first=self.first,
-            depth_scale=self.depth_scale,
-            convention=self.convention,
-            guess_camera=self.guess_camera,
-        )
+        found = self.opened()
         sequence = found.sequence
-        use_poses = poses_used(found, self.frames, self.poses)
+        use_poses = self.uses_poses(found, self.poses)
         figures: dict[str, Any] = {
             "object": str(self.frames),
             "seed": self.seed,

@@ -67,7 +67,8 @@ def assert_same_course(reports, whole_run):
     for report, expected in zip(reports, whole_run, strict=True):
         step, loss, iou, *_ = report
         assert step == expected.step
-        np.testing.assert_allclose([loss, iou], expected[1:3], rtol=1e-5)
+        np.testing.assert_allclose(loss, expected.loss, rtol=1e-5)
+        np.testing.assert_allclose(iou, expected.iou, atol=1e-4)  # a voxel may pass the threshold
 
 
 def assert_same_weights(folder, whole_run, start):
