@@ -43,7 +43,10 @@ cad_chairs: $(VENV)/.runtime
 	cd packages && npm pack open3dfloorplan@1.1.4 && tar -xzf open3dfloorplan-1.1.4.tgz
 	$(BIN)/python experiments/cad_seats.py --packages packages --output cad_chairs
 
-# One process for each core; most of their time goes into compiling.
+# One process for each core. Most of their time goes into compiling, so they share compiled programs,
+# which also serve the next run.
+test: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/out/compiled
+test: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
 test: $(VENV)/.develop
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
