@@ -209,8 +209,7 @@ def _place_first(
     floor, vertical = _floor_and_vertical(frame, found)
     up, of_up = _up(floor, vertical, T_world_camera, use_pose)
     cut = f"{frame.name}: {found.reason}"
-    is_doubtful = floor is None or floor.confidence < SURE
-    doubts = [cut] * (found.confidence < SURE) + [of_up] * is_doubtful
+    doubts = [cut] * (found.confidence < SURE) + [of_up] * (_sure(floor) is None)
     T_level_world = np.eye(4)
     T_level_world[:3, :3] = rotation_onto_y(up)
     prepared = prepare(frame)
@@ -259,6 +258,11 @@ def _floor_and_vertical(
     return floor, along_walls(planes)
 
 
+def _sure(floor: Floor | None) -> Floor | None:
+    """The floor, if it is sure."""
+    return floor if floor is not None and floor.confidence >= SURE else None
+
+
 def _up(
     floor: Floor | None,
     vertical: Float[np.ndarray, " 3"] | None,
@@ -271,7 +275,7 @@ def _up(
     top. If none of them is seen, the axes of the world or of the image are used.
     """
     R_world_camera = T_world_camera[:3, :3]
-    if vertical is not None and (floor is None or floor.confidence < SURE):
+    if vertical is not None and _sure(floor) is None:
         return R_world_camera @ vertical, "No floor is sure; the walls give the up direction."
     if floor is not None:
         up = R_world_camera @ np.asarray(floor.plane.normal, np.float64)
@@ -298,7 +302,8 @@ def _nearest_axis(up: Float[np.ndarray, " 3"]) -> tuple[Float[np.ndarray, " 3"],
 
 def _floor_height(floor: Floor | None, T_level_camera: Float[np.ndarray, "4 4"]) -> float:
     """y of the floor in the level frame, where it is sure; else NaN."""
-    if floor is None or floor.confidence < SURE:
+    floor = _sure(floor)
+    if floor is None:
         return np.nan
     on_floor = -floor.plane.offset * np.asarray(floor.plane.normal, np.float64)
     return float((T_level_camera[:3, :3] @ on_floor + T_level_camera[:3, 3])[1])
