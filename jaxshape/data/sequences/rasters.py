@@ -103,7 +103,7 @@ def _from_array(array: Any, most: int) -> Image.Image:
         if array.dtype.kind not in "iuf":
             raise ValueError(f"it is an array of {array.dtype}, not of numbers")
         if array.dtype.kind in "iu":
-            array = array.clip(0, _MOST).astype(np.int32)  # no depth is below 0
+            array = array.astype(np.int64).clip(0, _MOST).astype(np.int32)  # no depth is below 0
         else:
             with np.errstate(over="ignore"):
                 array = array.astype(np.float32)
