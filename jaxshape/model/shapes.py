@@ -161,9 +161,31 @@ def decode(
 
     Returns:
         Logits of each code `[*batch x y z]`.
+
+    Raises:
+        ValueError: The codes are not of the prior's size.
     """
     prepared = prior.model.prepare(prior.params, grids, "float32")
-    return decode_prepared(prior.model, prepared, code)
+    return decode_prepared(prior.model, prepared, as_codes(prior, code))
+
+
+def as_codes(prior: ShapePrior, code: Any) -> Float[Array, "*batch d"]:
+    """Codes as floating-point numbers, because losses and steps take the type of the code.
+
+    Args:
+        prior: The shape prior.
+        code: Codes of this prior `[*batch d]`, of any type of number.
+
+    Raises:
+        ValueError: The codes are not of the prior's size.
+    """
+    code, d = jnp.asarray(code), prior.code_size
+    if code.shape[-1:] != (d,):
+        raise ValueError(
+            f"code has shape {code.shape}; the codes of this prior have {d} numbers, so give"
+            f" [..., {d}]."
+        )
+    return code.astype(jnp.result_type(code.dtype, float))
 
 
 def decode_prepared(

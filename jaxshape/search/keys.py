@@ -20,9 +20,10 @@ def keys_of(
     Raises:
         ValueError: There are neither as many keys as codes nor one, or codes have another size.
     """
-    if codes.ndim != 2 or codes.shape[-1] != prior.code_size:
+    shape = jnp.shape(codes)
+    if len(shape) != 2 or shape[-1] != prior.code_size:
         raise ValueError(
-            f"codes have shape {codes.shape}; give [object, {prior.code_size}], one code for each "
+            f"codes have shape {shape}; give [object, {prior.code_size}], one code for each "
             "object of the batch (code[None] for one object)."
         )
     return one_key_each(keys, len(codes))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.chunks import vary_like
-from jaxshape.model.shapes import Precision, Prepared, ShapeModel, ShapePrior, pick
+from jaxshape.model.shapes import Precision, Prepared, ShapeModel, ShapePrior, as_codes, pick
 from jaxshape.search.curvature import Composed, Expansion, lanczos
 from jaxshape.search.residuals import BALANCED, Residual
 from jaxshape.search.rows import hoisted, loss_over_rows, of_one_row, one_network, over_rows
@@ -167,7 +167,8 @@ def objective(
         `gauss_newton` search finds its Gauss-Newton matrix, too.
 
     Raises:
-        ValueError: `jax.vmap` batches the parameters of the prior.
+        ValueError: `jax.vmap` batches the parameters of the prior. `loss` raises it for anything
+            other than one code of the prior's size.
     """
     batch = None if grids is None else jax.tree.map(lambda x: jnp.asarray(x)[None], grids)
     prepared = prepare_one(prior, batch, precision)
@@ -178,9 +179,26 @@ def objective(
         how = evaluation(prior.model, prepared, residual, penalty, chosen.to_code(point), own)
         return composed(how, chosen, own)
 
-    return Composed(
-        lambda point: about(point)(point), lambda point, count: about(point).expansion(point, count)
-    )
+    def loss(point):
+        point = _one_code(prior, point)
+        return about(point)(point)
+
+    def expansion(point, count):
+        point = _one_code(prior, point)
+        return about(point).expansion(point, count)
+
+    return Composed(loss, expansion)
+
+
+def _one_code(prior: ShapePrior, code: Float[Array, " d"]) -> Float[Array, " d"]:
+    """One code in floating point; `ValueError` for several."""
+    code = as_codes(prior, code)
+    if code.ndim != 1:
+        raise ValueError(
+            f"code has shape {code.shape}; the objective takes one code [{prior.code_size}], and"
+            " jax.vmap(objective) takes several."
+        )
+    return code
 
 
 def prepare_one(prior: ShapePrior, grids: Grids | None, precision: Precision) -> Prepared:

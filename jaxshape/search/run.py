@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.chunks import vary_like
-from jaxshape.model.shapes import Precision, ShapePrior, pick
+from jaxshape.model.shapes import Precision, ShapePrior, as_codes, pick
 from jaxshape.search.devices import over_devices
 from jaxshape.search.keys import keys_of
 from jaxshape.search.loop import Callback, Loop, Rows, SearchState
@@ -126,7 +126,7 @@ def refine(
         )
     rows = Rows(
         keys=keys_of(keys, codes, prior),
-        codes=codes,
+        codes=as_codes(prior, codes),
         targets=targets,
         grids=grids,
         first_losses=first_losses,

@@ -144,3 +144,28 @@ def test_it_scores_what_the_network_decodes(prior):
     np.testing.assert_allclose(losses, expected, rtol=1e-5)
     # The codes do matter: they differ by far more than rounding does.
     assert np.ptp(losses, axis=1).min() > 20 * 1e-5 * losses.max()
+
+
+def test_whole_numbers_are_a_code_like_any_other(unchecked_types, linear_prior):
+    """The loss takes the type of the code: it was cut off to 0."""
+    target = Target(*jnp.ones((2, 32, 32, 32)))
+    loss, expected = objective(linear_prior, target), objective(linear_prior, target)(jnp.ones(10))
+    assert loss(jnp.ones(10, int)) == expected > 0
+    refiner = build_refiner("gradient", 10, RefineConfig())
+    codes, targets = np.ones((1, 10)), jax.tree.map(lambda x: x[None], target)
+    found = [
+        refine(jax.random.key(0), linear_prior, codes.astype(kind), targets, refiner, 1).code
+        for kind in (np.int32, np.float32)
+    ]
+    np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize(
+    "shape, said", [((3,), r"shape \(3,\); the codes.*10 numbers"), ((1, 10), "takes one code")]
+)
+def test_codes_of_another_size_are_named(unchecked_types, linear_prior, shape, said):
+    target = Target(*jnp.ones((2, 32, 32, 32)))
+    with pytest.raises(ValueError, match=said):
+        objective(linear_prior, target)(jnp.ones(shape))
+    with pytest.raises(ValueError, match=r"shape \(2, 3\); the codes of this prior have 10"):
+        decode(linear_prior, jnp.ones((2, 3)))
