@@ -1,9 +1,10 @@
 """A problem of the benchmark: the objective of one object as a function of a code."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from numbers import Integral
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -125,29 +126,37 @@ def problems(
         One problem for each object, number of frames and kind.
 
     Raises:
-        ValueError: No problem is left, or the set was made for other weights.
+        ValueError: The set has no such objects, frames or kinds, or it was made for other weights.
     """
     found = packaged_set() if problem_set is None else problem_set
+    count = len(found.objects) if objects is None else objects
+    is_count = isinstance(count, Integral) and count >= 1
+    if not (is_count and _are_among(frames, FRAMES) and _are_among(kinds, KINDS)):
+        raise ValueError(
+            f"{found.name} has no matching problem; give objects from 1 to {len(found.objects)},"
+            f" a tuple of frames among {', '.join(map(str, FRAMES))} and a tuple of kinds among"
+            f" {', '.join(KINDS)}."
+        )
     prior = load_prior(WEIGHTS) if prior is None else prior
     if fingerprint(prior) != found.weights:
         raise ValueError(
             f"{found.name} searches the codes of other weights than these; give the shape prior"
             " that it was made for, or leave it out."
         )
-    count = len(found.objects) if objects is None else objects
     chosen = [
         key
         for key in found.keys()
         if key[1] < count and FRAMES[key[2]] in frames and key[3] in kinds
     ]
-    if not chosen:
-        raise ValueError(
-            f"{found.name} has no matching problem; give objects from 1 to {len(found.objects)},"
-            f" frames among {', '.join(map(str, FRAMES))} and kinds among {', '.join(KINDS)}."
-        )
     both = prior, _prepared(prior)
     made = {one.name: one for kind in KINDS for one in _of_kind(found, both, kind, chosen)}
     return [made[name] for name, *_ in chosen]
+
+
+def _are_among(values: Any, choices: Sequence[Any]) -> bool:
+    """Whether values are one or more of the choices, in a collection that is no text."""
+    is_collection = isinstance(values, Collection) and not isinstance(values, str)
+    return is_collection and len(values) > 0 and all(value in choices for value in values)
 
 
 def _prepared(prior: ShapePrior) -> ShapePrior:

@@ -57,8 +57,24 @@ def test_the_script_measures_what_is_stored(packaged):
 def test_problems_belong_to_their_weights(packaged, tiny_set, linear_prior):
     with pytest.raises(ValueError, match="other weights"):
         problems(prior=linear_prior)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"frames": (2,)},
+        {"frames": (4, 5)},
+        {"frames": 4},
+        {"frames": ()},
+        {"kinds": "clean"},
+        {"kinds": ("clean", "dirty")},
+        {"objects": 1.5},
+        {"objects": 0},
+    ],
+)
+def test_no_part_of_a_choice_is_dropped(unchecked_types, tiny_set, linear_prior, asked):
     with pytest.raises(ValueError, match="frames among 1, 4, 8"):
-        problems(frames=(2,), problem_set=tiny_set, prior=linear_prior)
+        problems(**asked, problem_set=tiny_set, prior=linear_prior)
 
 
 def test_a_problem_is_an_objective_of_codes(two, linear_prior):
