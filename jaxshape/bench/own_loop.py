@@ -135,8 +135,10 @@ def enter_benchmark(
         The file.
 
     Raises:
-        ValueError: The file holds results that were made in another way.
+        ValueError: There are no rows, they contradict the budget, or the file holds results that
+            were made in another way.
     """
+    _require_complete(rows, budget)
     path = Path(folder) / file_name(name)
     entry = new_entry(name, settings=settings, budget=budget, seed=seed)
     before = read_entry(path) if path.exists() else entry
@@ -145,3 +147,16 @@ def enter_benchmark(
     together = {key: row | {"together": len(rows)} for key, row in rows.items()}
     write_entry(path, with_rows(before, together))
     return path
+
+
+def _require_complete(rows: dict[str, Row], budget: int) -> None:
+    """Refuse rows that would claim another budget than the one that was watched."""
+    if not rows:
+        raise ValueError("There are no rows; give those of a watch, watch.rows().")
+    for name, row in rows.items():
+        if row["stop"] == "budget" and row["calls"] < budget:
+            raise ValueError(
+                f"The search of {name} stopped at its budget after {row['calls']} decoder calls,"
+                f" but budget is {budget}; give the budget of the watch, or say why the search"
+                " stopped before: watch.rows(stop='converged')."
+            )

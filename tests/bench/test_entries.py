@@ -7,6 +7,7 @@ import pytest
 from jaxshape.bench import entries
 from jaxshape.bench.config import BenchConfig
 from jaxshape.bench.entries import faults, file_name, read_entries, read_entry, write_entry
+from jaxshape.bench.own_loop import Watch, enter_benchmark
 from jaxshape.bench.run import run
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
@@ -118,3 +119,13 @@ def test_names_become_safe_files():
     assert file_name("evosax:Open_ES@18 sigma0=0.2") == "evosax_Open_ES@18_sigma0=0.2.json"
     assert file_name("../../x", "2/3") == "x.part-2-of-3.json"
     assert file_name("///") == "entry.json"
+
+
+def test_rows_that_contradict_their_budget_are_refused(two, tmp_path):
+    """They would appear on the board as the result of a budget that was never spent."""
+    watch = Watch(two, 64)
+    for rows, said in (({}, "There are no rows"), (watch.rows(), "0 decoder calls, but budget is")):
+        with pytest.raises(ValueError, match=said):
+            enter_benchmark(tmp_path, "own", rows)
+    path = enter_benchmark(tmp_path, "own", watch.rows("converged"), budget=64)
+    assert set(read_entry(path).rows) == {one.name for one in two}
