@@ -18,7 +18,7 @@ from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.names import find_build
 from jaxshape.search.reconstruction import search_space
-from jaxshape.search.refiner import Refiner, StopReason, advance
+from jaxshape.search.refiner import Refiner, StopReason, advance, as_promised
 from jaxshape.search.residuals import Target
 from jaxshape.search.space import LatentSpace
 
@@ -81,7 +81,7 @@ def _must_be_alone(refiner: Refiner, field: "_Field", example: Problem) -> bool:
     """Whether a step of the search evaluates points in a loop or branch, as line searches do."""
     objective = field.objectives(field.decoder, stacked_targets([example]))(jnp.int32(0))
     point, key = field.space.from_code(example.first_code), jax.random.key(0)
-    state, _ = refiner.init(key, point, jnp.float32(1))
+    state, _ = as_promised("init", refiner.init(key, point, jnp.float32(1)))
     step = lambda key, state: refiner.step(key, state, objective)  # noqa: E731
     return evaluates_in_a_branch(step, key, state)
 

@@ -14,7 +14,7 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.model.chunks import vary_like
 from jaxshape.search.devices import numbers
 from jaxshape.search.objective import Evaluation, ObjectTerms, composed
-from jaxshape.search.refiner import Refiner, StopReason, Trace, advance
+from jaxshape.search.refiner import Refiner, StopReason, Trace, advance, as_promised
 from jaxshape.search.space import LatentSpace
 
 # The arguments of a callback after each iteration: numbers of the objects [n], the iterations that
@@ -122,8 +122,8 @@ class Loop(NamedTuple):
         if loss is None or state is not None:
             loss = composed(self.how, self.space, own)(point)
         if state is None or self.refiner.resume is None:
-            return self.refiner.init(key, point, loss)
-        return self.refiner.resume(key, state, loss)
+            return as_promised("init", self.refiner.init(key, point, loss))
+        return as_promised("resume", self.refiner.resume(key, state, loss))
 
     def _move(self, rows: Rows, now: SearchState) -> SearchState:
         """One iteration of all objects; stopped objects do not change."""

@@ -11,10 +11,11 @@ then reach the decoder as one batch. `run.py` is the loop.
     state.best.point, state.best.loss, state.mean, state.stop
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -145,8 +146,48 @@ def advance(
         State and trace after the iteration; the same as before where the search has stopped.
     """
     running = state.stop == StopReason.RUNNING
-    stepped = refiner.step(key, state, only_where(running, objective))
+    stepped = as_promised("step", refiner.step(key, state, only_where(running, objective)))
+    _require_same(stepped, (state, trace))
     return select(running, stepped, (state, trace))
+
+
+def as_promised(function: str, returned: Any) -> tuple[Any, Trace]:
+    """What a function of a search returned, if it is a state and a trace.
+
+    Args:
+        function: Name of the function, `init`, `step` or `resume`.
+        returned: What it returned.
+
+    Raises:
+        ValueError: It is not what `Refiner` promises.
+    """
+    is_pair = isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], Trace)
+    fields = getattr(returned[0], "_fields", ()) if is_pair else ()
+    if not {"best", "mean", "stop"} <= set(fields):
+        raise ValueError(
+            f"{function} of the search must return a state and a jaxshape.Trace; the state is a"
+            " NamedTuple with best, mean and stop (jaxshape.Refiner explains them)."
+        )
+    return returned
+
+
+def _require_same(stepped: tuple[Any, Trace], before: tuple[Any, Trace]) -> None:
+    """Refuse a step that changes the shape or type of an array, which no compiled loop can."""
+    new, old = dict(_kinds(stepped)), dict(_kinds(before))
+    for name in old | new:
+        if new.get(name) != old.get(name):
+            raise ValueError(
+                f"step of the search returned {name} as {new.get(name)}; it was {old.get(name)}"
+                " before, and shapes and types must stay as init returns them."
+            )
+
+
+def _kinds(pair: tuple[Any, Trace]) -> Iterator[tuple[str, str]]:
+    """Name, and type with shape, of each array of a state and its trace."""
+    for tree, name in zip(pair, ("state", "trace"), strict=True):
+        for path, x in jax.tree_util.tree_leaves_with_path(tree):
+            kind = jax.typeof(x)
+            yield name + jax.tree_util.keystr(path), f"{kind.dtype}{list(kind.shape)}"
 
 
 def finite_or_inf(losses: Float[Array, "*n"]) -> Float[Array, "*n"]:

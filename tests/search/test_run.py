@@ -351,3 +351,26 @@ def test_keys_and_codes_that_do_not_fit_are_named(unchecked_types, counted, keys
     refiner = build_refiner("cma", D, CONFIG)
     with pytest.raises(ValueError, match=said):
         refine(keys, counted, codes, TARGETS, refiner, 2)
+
+
+GRADIENT = build_refiner("gradient", D, CONFIG)
+
+
+def floating(state, trace):
+    return state._replace(stop=jnp.float32(state.stop)), trace
+
+
+@pytest.mark.parametrize(
+    "name, change, said",
+    [
+        ("init", lambda state, trace: state, "init of the search must return a state and a"),
+        ("init", lambda state, trace: (state.best, trace), "a NamedTuple with best, mean and stop"),
+        ("step", lambda state, trace: (trace, state), "step of the search must return a state and"),
+        ("step", floating, r"returned state.stop as float32\[\]; it was int32\[\] before"),
+    ],
+)
+def test_a_search_that_breaks_its_promise_is_told_which(counted, name, change, said):
+    function = getattr(GRADIENT, name)
+    refiner = GRADIENT._replace(**{name: lambda *given: change(*function(*given))})
+    with pytest.raises(ValueError, match=said):
+        refine(KEYS, counted, CODES, TARGETS, refiner, 2)
