@@ -62,7 +62,8 @@ class ShapeModel:
             Differentiable in the codes.
         prepare: `(params, grids [b ...] | None, precision) -> Prepared`, called once per search.
             `precision` is the precision of the decoder's matrix products. A model that decodes from
-            the code alone ignores the grids, and works without any.
+            the code alone ignores the grids. None stands for one object of which nothing is known;
+            every model takes it, because jaxshape learns the resolution of a model in this way.
         shapes: `params -> ` a tree of `jax.ShapeDtypeStruct` with the same structure, for a model
             of the sizes that the parameters suggest; loading compares weights files with it. None
             compares only the results of `encode` and `decode`.
@@ -118,10 +119,28 @@ def resolution_of(model: ShapeModel, params: PyTree, code_size: int) -> int:
 def _resolution(model: ShapeModel, structure: Any, kinds: tuple[Any, ...], code_size: int) -> int:
     def decoded(params):
         prepared = model.prepare(params, None, "float32")
+        if not isinstance(prepared, Prepared):
+            raise ValueError(
+                f"prepare of the model {model.kind!r} returned a {type(prepared).__name__}; it must"
+                " return a Prepared(shared, own)."
+            )
         return model.decode(prepared, jnp.zeros((1, code_size)))
 
     shapes = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
-    return jax.eval_shape(decoded, jax.tree.unflatten(structure, shapes)).shape[-1]
+    logits = jax.eval_shape(decoded, jax.tree.unflatten(structure, shapes))
+    shape = getattr(logits, "shape", ())
+    if len(shape) != 4 or shape != (1, *3 * shape[-1:]) or not _is_single(logits.dtype):
+        kind = f"{logits.dtype} of shape {shape}" if shape else f"a {type(logits).__name__}"
+        raise ValueError(
+            f"decode of the model {model.kind!r} returned {kind} for one code; it must return"
+            " float32 logits [1, n, n, n], the same number of voxels along each axis."
+        )
+    return shape[-1]
+
+
+def _is_single(dtype: Any) -> bool:
+    """Whether numbers are floating-point numbers of single precision or better."""
+    return jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize >= 4
 
 
 def encode(prior: ShapePrior, grids: Grids) -> Float[Array, "*batch d"]:
@@ -135,13 +154,24 @@ def encode(prior: ShapePrior, grids: Grids) -> Float[Array, "*batch d"]:
         One code for each object `[*batch d]`.
 
     Raises:
-        ValueError: The grids are not of the prior's resolution.
+        ValueError: The grids are not of the prior's resolution, or its model returns codes of
+            another size.
     """
     require_resolution(prior, grids)
     batch = grids.occupied.shape[:-3]
     rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), grids)
     count = len(rows.occupied)
-    of_rows = lambda index: prior.model.encode(prior.params, pick(rows, index))  # noqa: E731
+
+    def of_rows(index):
+        codes = prior.model.encode(prior.params, pick(rows, index))
+        shape, wanted = jnp.shape(codes), (len(index), prior.code_size)
+        if shape != wanted:
+            raise ValueError(
+                f"encode of the model {prior.model.kind!r} returned shape {shape} for"
+                f" {len(index)} objects; it must return {wanted}, one code of this prior for each."
+            )
+        return codes
+
     return _a_few_at_a_time(of_rows, count).reshape(*batch, -1)
 
 

@@ -65,9 +65,15 @@ def whitened(prior: ShapePrior, bound: Float[Array, ""] | float | None = None) -
             box.
 
     Raises:
-        ValueError: The covariance of the codes is not positive semi-definite (raised outside
-            `jax.jit` only; inside, every loss of the search is NaN).
+        ValueError: The covariance of the codes has another shape, or is not positive semi-definite
+            (raised outside `jax.jit` only; inside, every loss of the search is NaN).
     """
+    shape, d = jnp.shape(prior.code_covariance), prior.code_size
+    if shape != (d, d):
+        raise ValueError(
+            f"code_covariance has shape {shape}, but code_mean has {d} numbers; give the covariance"
+            f" of the codes [{d}, {d}]."
+        )
     root = _root(prior.code_covariance)
     if not isinstance(root, Tracer) and not bool(jnp.all(jnp.isfinite(root))):
         raise ValueError(

@@ -1,5 +1,7 @@
 """What the seam promises for every model: any leading axes, few at a time, features of its own."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,3 +115,30 @@ def test_rounding_soft_grids_gives_the_papers():
     np.testing.assert_array_equal(rounded.occluded.ravel(), [False, True, False, True])
     again = binary(rounded)
     jax.tree.map(np.testing.assert_array_equal, again, rounded)
+
+
+@pytest.mark.parametrize(
+    "function, change, said",
+    [
+        (
+            "decode",
+            lambda logits: logits[..., None],
+            r"shape \(1, 4, 4, 4, 1\) for one code; it must",
+        ),
+        ("decode", lambda logits: logits[:, :2], r"shape \(1, 2, 4, 4\) for one code; it must"),
+        ("decode", lambda logits: logits > 0, r"bool of shape .*must return float32 logits"),
+        ("decode", lambda logits: (logits,), r"returned a tuple for one code"),
+        (
+            "encode",
+            lambda codes: codes[:, :2],
+            r"encode .* shape \(2, 2\) for 2 objects; .* \(2, 3\)",
+        ),
+        ("prepare", lambda prepared: prepared.shared, r"must return a Prepared\(shared, own\)"),
+    ],
+)
+def test_a_model_that_breaks_its_promise_is_told_which(unchecked_types, function, change, said):
+    """A channel axis was once told as grids of one voxel."""
+    right = getattr(CONDITIONED, function)
+    model = replace(CONDITIONED, **{function: lambda *given: change(right(*given))})
+    with pytest.raises(ValueError, match=said):
+        encode(PRIOR._replace(model=model), grids(2))
