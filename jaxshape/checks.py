@@ -56,6 +56,25 @@ def one_of(name: str, value: Any, choices: Iterable[Any]) -> None:
         refuse(name, value, " or ".join(map(repr, choices)))
 
 
+def instance(name: str, value: Any, kind: type, source: str) -> None:
+    """Refuse an argument of another type; its value may be too large to show.
+
+    Args:
+        name: Name of the argument.
+        value: The value to check.
+        kind: The type that it must have.
+        source: What returns such values, as "load_prior".
+
+    Raises:
+        ValueError: It has another type.
+    """
+    if not isinstance(value, kind):
+        raise ValueError(
+            f"{name} is of type {type(value).__name__}; give a {kind.__name__}, as {source} makes"
+            " it."
+        )
+
+
 def whole(name: str, value: Any, least: int, most: int | None = None, why: str = "") -> None:
     """Refuse a value that is not a whole number in a range.
 

@@ -39,6 +39,8 @@ def one_key_each(keys: Key[Array, "*object"], count: int) -> Key[Array, " object
     Raises:
         ValueError: There are neither as many keys as objects nor one.
     """
+    if not hasattr(keys, "dtype"):
+        raise ValueError(f"keys is {keys!r}; give random keys, as jax.random.key(0).")
     if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
         keys = jax.random.wrap_key_data(keys)
     if keys.ndim == 0:

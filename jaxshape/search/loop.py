@@ -58,6 +58,27 @@ class Rows(NamedTuple):
     warm_start: Any
 
 
+def require_rows(count: int, **trees: PyTree) -> None:
+    """Refuse an empty batch, and arrays without one row for each of its objects.
+
+    Args:
+        count: Number of objects.
+        trees: Arguments with arrays `[object ...]`, by their names.
+
+    Raises:
+        ValueError: There is no object, or an array has another number of rows.
+    """
+    if count == 0:
+        raise ValueError("There are no objects; give a batch of one or more.")
+    for name, tree in trees.items():
+        for leaf in jax.tree.leaves(tree):
+            if jnp.shape(leaf)[:1] != (count,):
+                raise ValueError(
+                    f"{name} has an array of shape {jnp.shape(leaf)}, but there are {count}"
+                    f" objects; give [{count}, ...], one row for each object."
+                )
+
+
 class Loop(NamedTuple):
     """The loop over iterations for a batch of objects.
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxshape import checks
 from jaxshape.checks import is_traced
 from jaxshape.geometry.grids import Grid, Grids
 from jaxshape.model.calibration import UNCALIBRATED
@@ -18,13 +19,13 @@ from jaxshape.search.composition import complete, known_or
 from jaxshape.search.config import RefineConfig, objective_for
 from jaxshape.search.devices import over_devices
 from jaxshape.search.keys import one_key_each
-from jaxshape.search.loop import Callback
+from jaxshape.search.loop import Callback, require_rows
 from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty
 from jaxshape.search.posterior import sample_codes
 from jaxshape.search.refiner import Refiner, Trace
 from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual
-from jaxshape.search.run import refine
+from jaxshape.search.run import refine, require_types
 from jaxshape.search.space import LatentSpace, raw, whitened
 
 
@@ -169,12 +170,16 @@ def reconstruct(
         devices: Devices of this process to spread objects over, 1 or more; None for all.
 
     Raises:
-        ValueError: The grids have no batch axis, differ in shape, or are not of the prior's
-            resolution; or there are neither as many keys as objects nor one.
+        ValueError: An argument is of another type; the grids have no batch axis, differ in shape,
+            are not of the prior's resolution, or hold NaN or values outside 0 to 1 (which is
+            checked outside `jax.jit` only); or there are neither as many keys as objects nor one.
     """
     grids = Grids(occupied, occluded, data)
+    checks.instance("config", config, RefineConfig, "RefineConfig()")
     require_batch(grids)
+    require_rows(len(grids.occupied), data=data, earlier=earlier)
     residual = residual_for(grids, config) if residual is None else residual
+    require_types(prior, refiner, residual)
 
     def rebuild(prior, rows):
         keys, grids, earlier = rows
@@ -345,13 +350,19 @@ def fit_surface(
 
 
 def require_batch(grids: Grids) -> None:
-    """Raise `ValueError` unless F and M are batches of grids of the same shape."""
+    """Raise `ValueError` unless F and M are batches of probabilities of the same shape."""
     shapes = jnp.shape(grids.occupied), jnp.shape(grids.occluded)
     if len(shapes[0]) != 4 or shapes[0] != shapes[1]:
         raise ValueError(
             f"occupied has shape {shapes[0]} and occluded {shapes[1]}; give both as "
             "[object, x, y, z], with an axis over objects: occupied[None] for a single one."
         )
+    require_rows(shapes[0][0])
+    for name, grid in zip(("occupied", "occluded"), grids[:2], strict=True):
+        if not is_traced(grid) and not bool(jnp.all(abs(grid - 0.5) < 0.501)):  # 0 to 1, rounded
+            raise ValueError(
+                f"{name} holds NaN or values outside 0 to 1; give booleans, or probabilities."
+            )
 
 
 def all_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> bool:

@@ -1,17 +1,18 @@
 """Refinement: the searches of many objects in one compiled program (the loop is in `loop`)."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from jaxshape import checks
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.chunks import vary_like
 from jaxshape.model.shapes import Precision, ShapePrior, as_codes, pick
 from jaxshape.search.devices import over_devices
 from jaxshape.search.keys import keys_of
-from jaxshape.search.loop import Callback, Loop, Rows, SearchState
+from jaxshape.search.loop import Callback, Loop, Rows, SearchState, require_rows
 from jaxshape.search.objective import (
     Evaluation,
     ObjectTerms,
@@ -116,9 +117,15 @@ def refine(
             `bfloat16`; `logits` and `loss` are float32 in any case.
 
     Raises:
-        ValueError: The arguments do not belong to the same number of objects, both `previous` and
-            `warm_start` are given, or `jax.vmap` is asked to search with several networks at once.
+        ValueError: An argument is of another type or out of its range, the arguments do not belong
+            to the same number of objects, both `previous` and `warm_start` are given, or `jax.vmap`
+            is asked to search with several networks at once.
     """
+    require_types(prior, refiner, residual)
+    checks.whole("iterations", iterations, 1)
+    checks.one_of("precision", precision, get_args(Precision))
+    if previous is not None:
+        checks.instance("previous", previous, Refined, "refine")
     if previous is not None and warm_start is not None:
         raise ValueError(
             "Both previous and warm_start are given; give previous to go on with the same targets,"
@@ -133,6 +140,8 @@ def refine(
         begun=None if previous is None else _begun(previous),
         warm_start=warm_start,
     )
+    alike = rows._asdict()
+    require_rows(len(alike.pop("codes")), **alike)
     space = raw(prior) if space is None else space
 
     def search(shared, rows):
@@ -161,6 +170,14 @@ def refine(
         )
 
     return over_devices(search, (prior, space, penalty_weight, target_loss), rows, devices)
+
+
+def require_types(prior: ShapePrior, refiner: Refiner | None, residual: Residual) -> None:
+    """Raise `ValueError` where a name or a function is given instead of the object."""
+    checks.instance("prior", prior, ShapePrior, "load_prior")
+    if refiner is not None:
+        checks.instance("refiner", refiner, Refiner, "build_refiner")
+    checks.instance("residual", residual, Residual, "Residual(target, score)")
 
 
 def _begun(previous: Refined) -> SearchState:

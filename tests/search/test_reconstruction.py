@@ -249,6 +249,9 @@ def test_one_key_serves_a_batch(linear_prior, searched):
         (OCCUPIED, OCCLUDED[:1], r"occluded \(1, 32, 32, 32\); give both as"),
         (jnp.zeros((1, 64, 64, 64), bool), jnp.zeros((1, 64, 64, 64), bool),
          r"this prior knows shapes of 32 x 32 x 32 voxels"),
+        (OCCUPIED[:0], OCCLUDED[:0], "There are no objects"),
+        (jnp.nan * OCCUPIED, 1.0 * OCCLUDED, "occupied holds NaN or values outside 0 to 1"),
+        (1.0 * OCCUPIED, 2 * OCCLUDED, "occluded holds NaN or values outside 0 to 1"),
     ],
 )  # fmt: skip
 def test_grids_that_do_not_fit_are_named(linear_prior, unchecked_types, occupied, occluded, said):
@@ -283,3 +286,22 @@ def test_soft_grids_compose_by_probability(linear_prior):
     mixed = (1 - M) * F + M * p
     clear = np.abs(mixed - 0.5) > 1e-4
     np.testing.assert_array_equal(found.composed[clear], (mixed > 0.5)[clear])
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"prior": "chair"}, "prior is of type str; give a ShapePrior, as load_prior makes it"),
+        ({"refiner": "cma"}, "refiner is of type str; give a Refiner, as build_refiner"),
+        ({"config": {}}, "config is of type dict; give a RefineConfig"),
+        ({"residual": "soft"}, "residual is of type str; give a Residual"),
+        ({"keys": 0}, r"keys is 0; give random keys, as jax.random.key\(0\)"),
+        ({"data": jnp.ones(3)}, r"data has an array of shape \(3,\), but there are 2 objects"),
+        ({"earlier": jnp.ones((2, 3))}, r"shape \(2, 3\); the codes of this prior have 10"),
+    ],
+)  # fmt: skip
+def test_arguments_of_another_kind_are_named(unchecked_types, linear_prior, change, said):
+    given = {"keys": KEYS, "prior": linear_prior, "occupied": OCCUPIED, "occluded": OCCLUDED,
+             "refiner": None, "config": CONFIG}  # fmt: skip
+    with pytest.raises(ValueError, match=said):
+        reconstruct(**given | change)

@@ -374,3 +374,26 @@ def test_a_search_that_breaks_its_promise_is_told_which(counted, name, change, s
     refiner = GRADIENT._replace(**{name: lambda *given: change(*function(*given))})
     with pytest.raises(ValueError, match=said):
         refine(KEYS, counted, CODES, TARGETS, refiner, 2)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"iterations": 0}, "iterations is 0; give a whole number, 1 or more"),
+        ({"precision": "float16"}, "precision is 'float16'; give 'float32' or 'bfloat16'"),
+        ({"previous": CODES}, "previous is of type ArrayImpl; give a Refined, as refine makes it"),
+        (
+            {"targets": of_object(0)},
+            r"targets has an array of shape \(1, 3, 3, 3\), but there are 3",
+        ),
+        (
+            {"first_losses": 1.0},
+            r"first_losses has an array of shape \(\), but there are 3 objects",
+        ),
+    ],
+)
+def test_arguments_that_do_not_fit_are_named(unchecked_types, counted, change, said):
+    given = {"keys": KEYS, "prior": counted, "codes": CODES, "targets": TARGETS,
+             "refiner": GRADIENT, "iterations": 2}  # fmt: skip
+    with pytest.raises(ValueError, match=said):
+        refine(**given | change)
