@@ -12,7 +12,7 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.model.chunks import vary_like
 from jaxshape.model.shapes import Precision, Prepared, ShapeModel, ShapePrior, as_codes, pick
 from jaxshape.search.curvature import Composed, Expansion, lanczos
-from jaxshape.search.residuals import BALANCED, Residual
+from jaxshape.search.residuals import BALANCED, Residual, one_loss
 from jaxshape.search.rows import hoisted, loss_over_rows, of_one_row, one_network, over_rows
 from jaxshape.search.space import LatentSpace, raw
 
@@ -73,8 +73,8 @@ def evaluation(
     """
 
     def price(code, logits, target, weight):
-        loss = residual.score(logits, target)
-        return loss if penalty is None else loss + weight * penalty(code)
+        loss = one_loss("score of the residual", residual.score(logits, target))
+        return loss if penalty is None else loss + weight * one_loss("penalty", penalty(code))
 
     row = jax.eval_shape(lambda own: jax.tree.map(lambda x: x[None], own), own.features)
     logits = jax.eval_shape(model.decode, Prepared(prepared.shared, row), code[None])

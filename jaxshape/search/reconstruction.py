@@ -24,7 +24,7 @@ from jaxshape.search.methods import build_refiner
 from jaxshape.search.objective import Penalty
 from jaxshape.search.posterior import sample_codes
 from jaxshape.search.refiner import Refiner, Trace
-from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual
+from jaxshape.search.residuals import BALANCED, RESIDUALS, Residual, one_loss
 from jaxshape.search.run import refine, require_types
 from jaxshape.search.space import LatentSpace, raw, whitened
 
@@ -186,7 +186,8 @@ def reconstruct(
         first_code = encode(prior, grids)
         first_logits = decode(prior, first_code, grids)
         targets = jax.vmap(residual.target)(grids, first_logits)
-        score = jax.vmap(residual.score)
+        score_one = lambda *x: one_loss("score of the residual", residual.score(*x))  # noqa: E731
+        score = jax.vmap(score_one)
         first_objective = score(first_logits, targets)
         start, start_objective = first_code, first_objective
         if earlier is not None:

@@ -13,7 +13,7 @@ measurement is. Your own residual needs only these two functions (docs/examples/
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,25 @@ class Residual(NamedTuple):
 
     target: Callable[[Grids, Float[Array, "x y z"]], PyTree]
     score: Callable[[Float[Array, "x y z"], PyTree], Float[Array, ""]]
+
+
+def one_loss(function: str, loss: Any) -> Float[Array, ""]:
+    """What a residual or a penalty returned, if it is one floating-point number.
+
+    Args:
+        function: Name of the function.
+        loss: What it returned.
+
+    Raises:
+        ValueError: It is anything else.
+    """
+    if loss is None or jnp.shape(loss) or not jnp.issubdtype(jnp.result_type(loss), jnp.floating):
+        kind = getattr(loss, "dtype", type(loss).__name__)
+        raise ValueError(
+            f"{function} must return one floating-point number for one candidate; it returned"
+            f" {kind} of shape {getattr(loss, 'shape', ())}."
+        )
+    return loss
 
 
 class Weights(NamedTuple):

@@ -298,6 +298,8 @@ def test_soft_grids_compose_by_probability(linear_prior):
         ({"keys": 0}, r"keys is 0; give random keys, as jax.random.key\(0\)"),
         ({"data": jnp.ones(3)}, r"data has an array of shape \(3,\), but there are 2 objects"),
         ({"earlier": jnp.ones((2, 3))}, r"shape \(2, 3\); the codes of this prior have 10"),
+        ({"residual": BALANCED._replace(score=lambda logits, target: logits.sum(0))},
+         r"score of the residual must return one .* float32 of shape \(32, 32\)"),
     ],
 )  # fmt: skip
 def test_arguments_of_another_kind_are_named(unchecked_types, linear_prior, change, said):

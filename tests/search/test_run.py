@@ -390,6 +390,7 @@ def test_a_search_that_breaks_its_promise_is_told_which(counted, name, change, s
             {"first_losses": 1.0},
             r"first_losses has an array of shape \(\), but there are 3 objects",
         ),
+        ({"penalty": lambda code: code}, r"penalty must return one .* float32 of shape \(4,\)"),
     ],
 )
 def test_arguments_that_do_not_fit_are_named(unchecked_types, counted, change, said):
