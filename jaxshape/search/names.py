@@ -50,6 +50,11 @@ def find_build(name: str) -> tuple[Build, str | None]:
     if variant and ("." in family or (family and importlib.util.find_spec(family))):
         function, _, variant = variant.partition("@")
         return _imported(name, family, function), variant or None
+    if name == "encoder":
+        raise ValueError(
+            f"'encoder' keeps the first code, but a search is needed here; choose from"
+            f" {', '.join(families())}."
+        )
     raise ValueError(
         f"There is no method {name!r}; choose from {', '.join(families())}, or 'encoder' for no"
         " search at all. Some have variants: cma:ipop, gradient:adam, evosax:Sep_CMA_ES. A function"

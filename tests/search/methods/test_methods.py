@@ -49,6 +49,7 @@ def test_every_name_gives_a_search_that_lowers_the_loss(name):
             "no method 'sgd'; choose from cma, evosax, gauss-newton, gradient, hybrid, or 'enc",
         ),
         ("", "no method ''; choose from"),
+        ("encoder", "'encoder' keeps the first code, but a search is needed here; choose from cma"),
         ("cma:nbipop", "choose cma, cma:ipop or cma:bipop"),
         ("gradient:adamm", "no optimiser 'adamm'"),
         ("hybrid:adamm", "no optimiser 'adamm'"),
