@@ -254,7 +254,10 @@ def _path(path: str | os.PathLike[str] | None) -> Path:
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     if not path.exists():
-        raise WeightsError(f"There is no weights file {str(path)!r}; make one: jaxshape train.")
+        raise WeightsError(
+            f"There is no weights file {str(path)!r}; make one (jaxshape train), or name weights of"
+            f" the package: {', '.join(PACKAGED)}."
+        )
     try:
         with reading.opened(path, limits.WEIGHT_BYTES), safe_open(path, "np") as file:
             metadata, names = file.metadata() or {}, list(file.keys())

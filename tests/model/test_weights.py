@@ -90,7 +90,8 @@ def test_names_of_arrays_and_nested_dictionaries_are_inverse(prior):
 @pytest.mark.parametrize("load", [load_prior, load_card])
 def test_a_missing_file_is_named(load, tmp_path):
     with pytest.raises(
-        WeightsError, match=r"no weights file .*nowhere\.safetensors.*jaxshape train"
+        WeightsError,
+        match=r"no weights file .*nowhere\.safetensors.*jaxshape train.*chair-autoencoder",
     ):
         load(tmp_path / "nowhere.safetensors")
 
