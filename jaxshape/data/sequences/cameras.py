@@ -100,7 +100,7 @@ def other_cameras(
         names: Names of its files.
         shape: Height and width of the depth images, in pixels.
     """
-    for name in _camera_files(names):
+    for name in _camera_files(name for name in names if name != camera.source):
         with suppress(SequenceError):  # it may be of other images
             other = _read_camera(folder / name, shape)
             # The same numbers may be meant from the corner or from the centre of a pixel.

@@ -98,8 +98,8 @@ def files_in(
             inside = list_folder(folder)  # reading them reports faults of other entries
             found = (os.path.splitext(file) for file in inside.files | inside.others)
             chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
-            numbers = number_pattern([stem for stem, _ in chosen])
-            chosen.sort(key=lambda one: (_natural(one[0], numbers), suffixes.index(one[1].lower())))
+            natural = natural_order([stem for stem, _ in chosen])
+            chosen.sort(key=lambda one: (natural(one[0]), suffixes.index(one[1].lower())))
             return {stem: folder / (stem + end) for stem, end in chosen}
     return {}
 
@@ -231,7 +231,15 @@ def number_pattern(names: Iterable[str]) -> str:
     return r"\d+(?:\.\d+)?" if is_decimal else r"\d+"
 
 
-def _natural(name: str, numbers: str) -> list[str | Decimal]:
-    """Sorting key of a name: its numbers are compared as numbers, other text as text."""
-    words = re.split(f"({numbers})", name)
-    return [Decimal(word) if i % 2 else word for i, word in enumerate(words)]
+def natural_order(names: Iterable[str]) -> Callable[[str], list[str | int | Decimal]]:
+    """Sorting key for names: their numbers are compared as numbers, other text as text."""
+    pattern = number_pattern(names)
+    split = re.compile(f"({pattern})").split
+    number = int if "." not in pattern else Decimal
+
+    def key(name):
+        words = split(name)
+        words[1::2] = map(number, words[1::2])
+        return words
+
+    return key

@@ -58,9 +58,10 @@ def unmatched(contents: Contents, listed: Listed) -> Iterator[Finding]:
 
     Images that are paired by time are left to the inspection of a recording.
     """
-    files, colors = listed.files, len(color_images(contents))
+    files = listed.files
     alone = sum(one.color is None for one in files)
-    if alone and listed.color_delays is None and (colors or alone < len(files)):
+    colors = len(color_images(contents)) if alone and listed.color_delays is None else 0
+    if colors or listed.color_delays is None and 0 < alone < len(files):
         there = f", although there are {colors} of them" if colors else ""
         yield Finding(
             f"{alone} of {len(files)} depth images have no colour image{there}",
@@ -68,7 +69,7 @@ def unmatched(contents: Contents, listed: Listed) -> Iterator[Finding]:
             "has a list. If one kind is counted from 0 and the other from 1, all colours are a "
             "frame late.",
         )
-    if (masks := len(mask_images(contents))) and not any(one.mask for one in files):
+    if not any(one.mask for one in files) and (masks := len(mask_images(contents))):
         yield Finding(
             f"none of {masks} masks is read",
             "Give each mask the name of its depth image, and list it if the recording has a list.",
