@@ -52,7 +52,7 @@ def mirrored(evidence: Evidence, nats: float = NATS) -> Mirrored:
     axes = (-3, -2, -1)
     other_free = mirror(free)
     denied = surface * _least_nearby(other_free)
-    agreed = surface * mirror(_greatest_nearby(surface))
+    agreed = surface * mirror(greatest_nearby(surface))
     both = denied.sum(axes) + agreed.sum(axes)
     agreement = jnp.where(both > 0, agreed.sum(axes) / jnp.where(both > 0, both, 1), 1.0)
     symmetric = agreement > AGREEMENT
@@ -69,13 +69,17 @@ def symmetrised(
     return jnp.where(symmetric, (logits + mirror(logits)) / 2, logits) + found.logits
 
 
-def _greatest_nearby(x: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
-    """The greatest value among each voxel and its 26 neighbours."""
+def greatest_nearby(x: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
+    """The greatest value among each voxel and its 26 neighbours; opposite borders are neighbours.
+
+    Args:
+        x: Values of a grid whose borders are free.
+    """
     for axis in (-3, -2, -1):
-        before, after = (jnp.roll(x, shift, axis) for shift in (1, -1))  # borders are free
+        before, after = (jnp.roll(x, shift, axis) for shift in (1, -1))
         x = jnp.maximum(x, jnp.maximum(before, after))
     return x
 
 
 def _least_nearby(x: Float[Array, "*batch x y z"]) -> Float[Array, "*batch x y z"]:
-    return -_greatest_nearby(-x)
+    return -greatest_nearby(-x)

@@ -86,8 +86,8 @@ class PlacementConfig:
 COMPARED_POINTS = 2048
 """Points on the object that shapes are compared with."""
 
-FREE_WEIGHT = 3.0
-"""Weight of free points against measured ones: most are far from any surface, and say little."""
+FREE_WEIGHT = 2.0
+"""Weight of free points against measured ones: most are not next to a surface, and say little."""
 
 OUTSIDE_WEIGHT = 0.1
 """Nats for every voxel by which a measured point lies outside its box, up to four voxels."""

@@ -1,7 +1,7 @@
 """Points on an object, and free points around it, from depth frames.
 
 Their number is always the same, whatever the size and number of the images, so that functions of
-them are compiled once.
+them are compiled once. Free points are dense near the object: they tell where it ends.
 """
 
 from typing import NamedTuple
@@ -9,13 +9,21 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jaxlie
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxshape.geometry import camera
+from jaxshape.geometry import camera, fusion, grid
 from jaxshape.geometry.camera import Intrinsics
+from jaxshape.geometry.symmetry import greatest_nearby
 
 SURFACE_POINTS, FREE_POINTS = 8192, 4096
-"""Numbers of points of each frame: on the object, enough to fill a grid, and in free space."""
+"""Numbers of points: on the object, enough to fill a grid, and in free space."""
+
+FREE_CANDIDATES = 4 * FREE_POINTS
+"""Number of free points of each frame, from which those of all frames together are drawn."""
+
+EXTENT = 0.7
+"""Rough size of an object, in metres."""
 
 REACH = 1.2
 """Radius of the ball around the object in which rays count, in typical extents."""
@@ -24,14 +32,23 @@ FREE_GAP = 0.06
 """Length of the last stretch of a ray before its hit that does not count as free space, in typical
 extents. It covers noise and the thickness of a voxel."""
 
+CELL, CELLS = 0.07, 40
+"""Edge of the cells in which free points are counted, in typical extents, and their number along
+each axis."""
+
+FADING, FADED = 0.7, 10
+"""Density of free points in a cell, relative to the next cell towards the object, and the number of
+cells from which on it is constant."""
+
 
 class RaySamples(NamedTuple):
     """Points on an object, and free points around it, from depth frames.
 
     Attributes:
         surface: Measured points of the object `[*batch n 3]`, in metres and in random order.
-        free: Points in free space `[*batch m 3]`, in metres, spread evenly over the free parts of
-            the rays around the object.
+        free: Points in free space `[*batch m 3]`, in metres. Those of one frame are spread evenly
+            over the free parts of the rays around the object; those of several frames evenly over
+            space, but more densely near the object.
         away: Direction from the camera to the object `[*batch 3]`; for several frames the mean of
             the unit vectors, which is short where the object was seen from all sides.
     """
@@ -46,7 +63,7 @@ def sample_rays(
     depth: Float[Array, "h w"],
     segmented: Bool[Array, "h w"],
     intrinsics: Intrinsics,
-    extent: float = 0.7,
+    extent: float = EXTENT,
 ) -> RaySamples:
     """Samples of one frame, in the frame of its camera; the same number of points for every frame.
 
@@ -74,7 +91,7 @@ def sample_rays(
     near, far = _through_ball(rays, center, REACH * extent)
     far = jnp.minimum(far, end - FREE_GAP * extent)
     length = jnp.where(jnp.isnan(center[0]), 0, jnp.maximum(far - near, 0))
-    ray = _draw(ray_key, jnp.int32(length / (REACH * extent) * 500), FREE_POINTS)
+    ray = _draw(ray_key, jnp.int32(length / (REACH * extent) * 500), FREE_CANDIDATES)
     z = near[ray] + length[ray] * jax.random.uniform(depth_key, ray.shape)
     return RaySamples(
         surface=points[_draw(surface_key, jnp.int32(is_object), SURFACE_POINTS)],
@@ -103,14 +120,15 @@ def _draw(key: Key[Array, ""], weight: Int[Array, " n"], count: int) -> Int[Arra
     return jnp.searchsorted(total, mark, side="right")
 
 
-def pooled(samples: RaySamples, T_world_camera: jaxlie.SE3) -> RaySamples:
-    """Samples of several frames together, with as many points as those of one frame.
+def pooled(samples: RaySamples, T_world_camera: jaxlie.SE3, extent: float = EXTENT) -> RaySamples:
+    """Samples of several frames together, as many points whatever the number of frames.
 
     Frames in which nothing was segmented are left out.
 
     Args:
         samples: Samples of the frames, along a leading axis, each in the frame of its camera.
         T_world_camera: Poses of the frames.
+        extent: Rough size of the object, in metres.
 
     Returns:
         The samples in the world.
@@ -118,11 +136,28 @@ def pooled(samples: RaySamples, T_world_camera: jaxlie.SE3) -> RaySamples:
     is_empty = jnp.isnan(samples.away[:, 0])
     frames = jnp.argsort(is_empty)  # the others first
     count = jnp.maximum(jnp.sum(~is_empty), 1)
-
-    def some_of_each(points):
-        points = camera.transform(T_world_camera, points)
-        place = jnp.arange(points.shape[1])
-        return points[frames[place % count], place]  # which are in random order
-
+    place = jnp.arange(samples.surface.shape[1])
+    surface = camera.transform(T_world_camera, samples.surface)
+    surface = surface[frames[place % count], place]  # which are in random order
+    free = camera.transform(T_world_camera, samples.free).reshape(-1, 3)
     away = jnp.nanmean(T_world_camera.rotation() @ samples.away, axis=0)
-    return RaySamples(some_of_each(samples.surface), some_of_each(samples.free), away)
+    return RaySamples(surface, free[_spread(free, surface, CELL * extent)], away)
+
+
+def _spread(
+    free: Float[Array, "n 3"], surface: Float[Array, "m 3"], cell: float
+) -> Int[Array, " k"]:
+    """Indices of free points that are spread evenly over space, but more densely near the object.
+
+    Rays are dense near the camera and where many frames look. The density of the chosen points
+    depends only on the distance from the measured surface.
+    """
+    center = jnp.median(surface, axis=0)
+    surface, free = ((points - center) / cell + CELLS / 2 for points in (surface, free))
+    near = jnp.float32(fusion.count_points(surface, CELLS) > 0)
+    near = lax.fori_loop(0, FADED, lambda _, x: jnp.maximum(x, FADING * greatest_nearby(x)), near)
+    density = jnp.maximum(near, FADING**FADED) / jnp.maximum(fusion.count_points(free, CELLS), 1)
+    weight = density.ravel().at[grid.flat_index(free.T, CELLS)].get(mode="fill", fill_value=0)
+    total = jnp.cumsum(weight)
+    mark = (jnp.arange(FREE_POINTS) + 0.5) * (total[-1] / FREE_POINTS)
+    return jnp.searchsorted(total, mark)

@@ -104,7 +104,7 @@ def slow_misfit(logits, box, seen, config):
         free.append(surprise(1 - sigmoid(logit(at_centers, voxel(p)))))
     sizes = zip(upper - lower, config.typical_size, config.size_spread, strict=True)
     unusual = sum((np.log(size / typical) / spread) ** 2 for size, typical, spread in sizes)
-    return np.mean(measured) + 3 * np.mean(free) + 0.1 * np.mean(outside) + 0.0015 * unusual
+    return np.mean(measured) + 2 * np.mean(free) + 0.1 * np.mean(outside) + 0.0015 * unusual
 
 
 def test_misfit_agrees_with_a_slow_reference():

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from jaxshape.geometry import camera
-from jaxshape.mapping.placement.rays import pooled, sample_rays
+from jaxshape.mapping.placement.rays import FREE_POINTS, RaySamples, pooled, sample_rays
 
 
 @pytest.fixture(scope="module")
@@ -63,17 +64,32 @@ def test_a_frame_without_the_object_gives_nothing_finite(nothing):
 
 
 def test_pooling_takes_as_much_of_each_frame_and_moves_it_to_the_world(seen):
-    T_world_camera = jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3.from_y_radians(jnp.array([0.0, np.pi])), jnp.array([[0.0, 0, 0], [0, 5, 0]])
-    )
+    turned = jaxlie.SO3.from_y_radians(jnp.array([0.0, np.pi]))
+    shift = jnp.array([[0.0, 0, 0], [0, 0.5, 0]])
     two = jax.tree.map(lambda x: jnp.stack([x, x]), seen)
-    both = jax.jit(pooled)(two, T_world_camera)
-    assert jax.tree.map(jnp.shape, both) == jax.tree.map(jnp.shape, seen)
-    for points in (both.surface, both.free):
-        is_second = points[:, 1] > 2
-        assert is_second.sum() == len(points) // 2
-        assert ((points[:, 2] > 0) == ~is_second).all()  # turned by half
+    both = jax.jit(pooled)(two, jaxlie.SE3.from_rotation_and_translation(turned, shift))
+    assert both.surface.shape == seen.surface.shape and both.free.shape == (FREE_POINTS, 3)
+    is_second = both.surface[:, 2] < 0  # turned by half
+    assert is_second.sum() == len(both.surface) // 2
     np.testing.assert_allclose(both.away[::2], 0, atol=1e-6)  # seen from two opposite sides
+    for name in ("surface", "free"):
+        points = np.asarray(getattr(seen, name))
+        moved = np.concatenate([points, points * (-1, 1, -1) + (0, 0.5, 0)])
+        distance, _ = KDTree(moved).query(getattr(both, name))
+        assert distance.max() < 1e-6
+
+
+def test_free_points_are_as_many_on_a_side_that_few_frames_saw():
+    """A cube, free on both sides: one frame sees the right one, three see the left one."""
+    rng = np.random.default_rng(0)
+    cube = rng.uniform(-0.1, 0.1, (4, 8192, 3))
+    beside = rng.uniform((0.12, -0.3, -0.3), (0.68, 0.3, 0.3), (4, 16384, 3))
+    beside[1:, :, 0] *= -1
+    frames = RaySamples(*map(jnp.float32, (cube, beside, np.ones((4, 3)))))
+    x = np.asarray(jax.jit(pooled)(frames, jaxlie.SE3.identity((4,))).free[:, 0])
+    assert 0.47 < np.mean(x < 0) < 0.53
+    near, far = np.abs(x) < 0.3, np.abs(x) > 0.5  # of the same volume
+    assert near.sum() > 4 * far.sum() > 0
 
 
 def test_pooling_leaves_frames_without_the_object_out(seen, nothing):
