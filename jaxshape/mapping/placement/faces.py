@@ -33,8 +33,9 @@ CLEAR = 0.02
 """Distance from a point to the hit of a ray behind it, in metres, at which the ray has surely
 passed the point."""
 
-STRAY = 1 / 400
-"""Share of the measured points that may lie beyond a face because of noise."""
+STRAY = 1 / 2000
+"""Share of the measured points that may lie beyond a face because of noise. It is less than that of
+a castor."""
 
 SPREADS = 2.0
 """Size of the prior's largest object, in standard deviations of the logarithms of the extents."""

@@ -33,8 +33,8 @@ def corners(box):
     return np.stack([middle - box.size / 2, middle + box.size / 2])
 
 
-def view(eye, target=(0, 0.45, 0)):
-    seen = room([FLOOR, CHAIR], eye, target, noise=0.3)
+def view(eye, target=(0, 0.45, 0), chair=CHAIR):
+    seen = room([FLOOR, chair], eye, target, noise=0.3)
     segmented = seen.label == 1
     return Cutout(jnp.float32(seen.depth), segmented, intrinsics_of(K), seen.T_world_camera)
 
@@ -47,6 +47,13 @@ def test_a_chair_seen_from_all_around_ends_where_it_does(error):
     assert faces is not None and faces.seen[:, [0, 2]].all() and faces.seen[1, 1]
     np.testing.assert_allclose(corners(fitted(box, faces))[:, [0, 2]], TRUE[:, [0, 2]], atol=0.025)
     assert corners(fitted(box, faces))[1, 1] == pytest.approx(0.95, abs=0.025)
+
+
+def test_a_castor_of_few_pixels_is_inside_the_box():
+    castor = ((0.24, 0, -0.02), (0.28, 0.03, 0.02))
+    views = [view(eye, chair=[*CHAIR, castor]) for eye in AROUND]
+    faces = faces_of(box_of(*TRUE), views)
+    assert faces is not None and faces.seen[1, 0] and 0.265 < faces.upper[0] < 0.3
 
 
 def test_a_box_fits_until_a_face_is_seen_elsewhere_than_it_lies():
