@@ -31,6 +31,18 @@ from jaxshape.search.reconstruction import refiner_for
 # The same examples each time, without deadlines: what fails, fails for the change that broke it.
 settings.load_profile("ci")
 
+MAPS = Path("/proc/self/maps")
+MOST_MAPS = 30_000
+"""Memory maps of a process from which on compiled programs are dropped. Each program takes some,
+and Linux allows 65,530: the whole suite in one process would crash."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+
 
 @pytest.fixture(scope="session")
 def prior() -> ShapePrior:
