@@ -33,7 +33,7 @@ CLEAR = 0.02
 """Distance from a point to the hit of a ray behind it, in metres, at which the ray has surely
 passed the point."""
 
-STRAY = 1 / 2000
+STRAY = 1 / 1000
 """Share of the measured points that may lie beyond a face because of noise. It is less than that of
 a castor."""
 
