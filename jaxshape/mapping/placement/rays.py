@@ -158,6 +158,7 @@ def _spread(
     near = lax.fori_loop(0, FADED, lambda _, x: jnp.maximum(x, FADING * greatest_nearby(x)), near)
     density = jnp.maximum(near, FADING**FADED) / jnp.maximum(fusion.count_points(free, CELLS), 1)
     weight = density.ravel().at[grid.flat_index(free.T, CELLS)].get(mode="fill", fill_value=0)
-    total = jnp.cumsum(weight)
+    # Without the maximum, rounding in the running sum would let points of weight 0 be chosen.
+    total = lax.cummax(jnp.where(weight > 0, jnp.cumsum(weight), 0))
     mark = (jnp.arange(FREE_POINTS) + 0.5) * (total[-1] / FREE_POINTS)
     return jnp.searchsorted(total, mark)

@@ -97,5 +97,6 @@ def test_pooling_leaves_frames_without_the_object_out(seen, nothing):
     found = jax.jit(pooled)(three, jaxlie.SE3.identity((3,)))
     np.testing.assert_allclose(found.away, seen.away, rtol=1e-6)
     assert set(np.asarray(found.surface).ravel()) <= set(np.asarray(seen.surface).ravel())
+    assert set(np.asarray(found.free).ravel()) <= set(np.asarray(seen.free).ravel())
     none = jax.jit(pooled)(jax.tree.map(lambda x: x[None], nothing), jaxlie.SE3.identity((1,)))
     assert jnp.isnan(none.surface).all()
