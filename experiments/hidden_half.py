@@ -150,7 +150,7 @@ def scores_of(grids: Grids, logits, case: Case, conditional: bool, fill_logits=N
         symmetry=True,
         conditional=conditional,
     )
-    hidden = occluded_scores(filled.logits, grids.occluded, case.surface)
+    hidden = occluded_scores(filled.composed, filled.logits, grids.occluded, case.surface)
     return Scores(iou(logits > 0, case.surface), iou(filled.composed, case.surface), hidden.iou)
 
 

@@ -60,7 +60,7 @@ from .results.metrics import (
 from .results.surface import surface, write_mesh
 from .search.calibrating import fit_calibration
 from .search.cma import CmaState, cma_ask, cma_start, cma_tell
-from .search.composition import Composition, complete, compose
+from .search.composition import Composition, best_threshold, complete, compose
 from .search.config import RefineConfig
 from .search.export import export_reconstruct, load_reconstruct
 from .search.methods import build_refiner
@@ -166,6 +166,7 @@ __all__ = [
     "VirtualCamera",
     "Watch",
     "Weights",
+    "best_threshold",
     "binary",
     "bounds",
     "build_classes",

@@ -211,9 +211,9 @@ folder; first k frames of an orbit at
 
 IoU, Chamfer-L1 (a fraction of the bounding-box diagonal) and F-score (at 1 % of the grid's side)
 are of the decoded shape; the composed shape keeps measured voxels and fills in only occluded ones.
-IoU occluded is the IoU in the occluded voxels alone, nats occluded their cross-entropy. F is the
-measurement alone, F or M the measurement with all occluded voxels filled. Single meshes are in
-evaluation.json."""
+IoU occluded is that of the composed shape in the occluded voxels alone, nats occluded the
+cross-entropy there. F is the measurement alone, F or M the measurement with all occluded voxels
+filled. Single meshes are in evaluation.json."""
 
 
 def _seen(config: dict[str, Any]) -> str:

@@ -209,7 +209,9 @@ def _scores(case: Case, found: dict[str, Any], row: int) -> dict[str, Any]:
     scores: dict[str, Any] = {}
     for method, result in found.items():
         shape = shape_scores(result.completed[row], case.surface)
-        hidden = occluded_scores(result.fill_logits[row], case.grids.occluded, case.surface)
+        hidden = occluded_scores(
+            result.composed[row], result.fill_logits[row], case.grids.occluded, case.surface
+        )
         scores[method] = {
             "iou": shape.iou,
             "iou_composed": float(iou(result.composed[row], case.surface)),

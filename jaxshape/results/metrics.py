@@ -152,10 +152,11 @@ class OccludedScores(NamedTuple):
     axes.
 
     Attributes:
-        iou: Intersection over union of the voxels that are occluded, from 0 to 1. Where none of
-            them holds a piece of the true surface, 1 if none is filled and 0 otherwise.
-        cross_entropy: Mean over the occluded voxels, in nats for each of them; 0 where there are
-            none.
+        iou: Intersection over union of the composed shape with the true one among the occluded
+            voxels, from 0 to 1. Where none of them holds a piece of the true surface, 1 if none is
+            filled and 0 otherwise.
+        cross_entropy: Mean over the occluded voxels, in nats for each of them, of the logits that
+            fill them; 0 where there are none.
     """
 
     iou: Float[Array, "..."]
@@ -163,6 +164,7 @@ class OccludedScores(NamedTuple):
 
 
 def occluded_scores(
+    composed: Bool[Array | np.ndarray, "*batch x y z"],
     logits: Float[Array | np.ndarray, "*batch x y z"],
     occluded: Float[Array | np.ndarray, "*batch x y z"] | Bool[Array | np.ndarray, "*batch x y z"],
     truth: Bool[Array | np.ndarray, "*batch x y z"],
@@ -170,6 +172,7 @@ def occluded_scores(
     """Score the shape in the occluded voxels, which are those more likely unknown than not.
 
     Args:
+        composed: The composed shape `[*batch x y z]`.
         logits: Logits of the shape that fills them `[*batch x y z]`.
         occluded: M `[*batch x y z]`, binary or soft: voxels above 1/2 count.
         truth: True surface voxels `[*batch x y z]`.
@@ -178,7 +181,7 @@ def occluded_scores(
     loss = optax.sigmoid_binary_cross_entropy(jnp.asarray(logits), jnp.asarray(truth, jnp.float32))
     total = jnp.sum(loss, axis=axes, where=hidden)
     return OccludedScores(
-        iou((logits > 0) & hidden, truth & hidden),
+        iou(composed & hidden, truth & hidden),
         total / jnp.maximum(jnp.sum(hidden, axis=axes), 1),
     )
 

@@ -38,7 +38,8 @@ class Reconstruction(NamedTuple):
         completed_first: The decoded first code, G(lambda_0) > 0.5 `[object x y z]`.
         logits: Logits of the refined shape `[object x y z]`.
         completed: The refined shape, G(lambda) > 0.5 `[object x y z]`.
-        composed: The measurement in measured voxels, the filling elsewhere `[object x y z]`.
+        composed: The measurement in measured voxels, the filling elsewhere `[object x y z]`
+            (`complete`).
         fill_logits: Logits of the filling `[object x y z]`: the refined shape or, for a symmetric
             object, its average with the mirror image plus the evidence measured on the other side.
         symmetric: Whether the filling is mirrored `[object]`; None without `config.symmetry`.
@@ -219,7 +220,11 @@ def reconstruct(
             )
             code, logits, objective = found.code, found.logits, score(found.logits, targets)
         filled = complete(
-            grids, logits, symmetry=config.symmetry, conditional=prior.model.conditional
+            grids,
+            logits,
+            symmetry=config.symmetry,
+            conditional=prior.model.conditional,
+            calibration=prior.calibration,
         )
         shape = Reconstruction(
             first_code=first_code,

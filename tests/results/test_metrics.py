@@ -47,7 +47,7 @@ def test_occluded_scores_against_loops():
         either += (logit > 0) or true
         p = 1 / (1 + np.exp(-logit))
         losses.append(-np.log(p if true else 1 - p))
-    found = occluded_scores(logits, M, truth)
+    found = occluded_scores(logits > 0, logits, M, truth)
     assert float(found.iou) == pytest.approx(agree / either)
     assert float(found.cross_entropy) == pytest.approx(np.mean(losses), rel=1e-5)
 
@@ -55,16 +55,16 @@ def test_occluded_scores_against_loops():
 def test_occluded_scores_do_not_depend_on_what_was_measured():
     logits, M = np.random.default_rng(1).normal(size=(4, 4, 4)), random_grids(4, 4, 4, seed=2)
     truth = random_grids(4, 4, 4, seed=3)
-    other = occluded_scores(np.where(M, logits, -9.0), M, truth | ~M)
-    assert occluded_scores(logits, M, truth) == other
+    other = occluded_scores((logits > 0) & M, np.where(M, logits, -9.0), M, truth | ~M)
+    assert occluded_scores(logits > 0, logits, M, truth) == other
 
 
 def test_occluded_voxels_without_surface_are_right_where_nothing_fills_them():
     nothing, hidden = np.zeros((4, 4, 4), bool), box((0, 0, 0), (2, 2, 2), 4)
     full, empty = np.full((4, 4, 4), 8.0), np.full((4, 4, 4), -8.0)
-    assert float(occluded_scores(empty, hidden, nothing).iou) == 1
-    assert float(occluded_scores(full, hidden, nothing).iou) == 0
-    assert occluded_scores(full, nothing, hidden) == (1, 0)  # nothing is occluded
+    assert float(occluded_scores(nothing, empty, hidden, nothing).iou) == 1
+    assert float(occluded_scores(~nothing, full, hidden, nothing).iou) == 0
+    assert occluded_scores(~nothing, full, nothing, hidden) == (1, 0)  # nothing is occluded
 
 
 def test_point_distances_against_brute_force():

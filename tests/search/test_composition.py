@@ -1,5 +1,7 @@
 """The composed shape keeps what was measured; its mirror image tells of what is hidden."""
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,14 @@ import pytest
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.symmetry import mirror
-from jaxshape.search.composition import agreed, complete, compose
+from jaxshape.model.calibration import Calibration
+from jaxshape.search.composition import (
+    LEAST_PROBABILITY,
+    agreed,
+    best_threshold,
+    complete,
+    compose,
+)
 
 KEY = jax.random.key(0)
 LOGITS = jax.random.normal(KEY, (2, 16, 16, 16))
@@ -90,7 +99,51 @@ def test_soft_grids_count_as_much_as_a_decoder_that_knew_them():
     F = jnp.array([0.9, 0.9, 0.1, 0.1, 0.9, 0.1]).reshape(1, 1, 6)
     M = jnp.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0]).reshape(1, 1, 6)
     p = jnp.array([0.2, 0.05, 0.95, 0.8, 0.4, 0.6]).reshape(1, 1, 6)
-    np.testing.assert_array_equal(agreed(F, M, p).ravel(), [True, False, True, False, False, True])
+    found = agreed(F, M, p).ravel() > 0.5
+    np.testing.assert_array_equal(found, [True, False, True, False, False, True])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_set_of_voxels_has_a_greater_expected_iou(seed):
+    p = np.random.default_rng(seed).beta(1, 0.5, 8)  # the threshold is above the least one
+    sets = np.array(list(product([False, True], repeat=8)))
+    iou = (sets @ p) / (sets.sum(1) + (~sets) @ p)
+    threshold = float(best_threshold(jnp.asarray(p).reshape(2, 2, 2)))
+    np.testing.assert_array_equal(p > threshold, sets[np.argmax(iou)])
+    assert threshold == pytest.approx(iou.max() / (1 + iou.max()), abs=1e-6)
+
+
+def test_the_threshold_lies_between_a_third_and_a_half():
+    surface = jax.random.bernoulli(KEY, 0.3, (16, 16, 16)).astype(float)
+    sure, vague, none = surface, 0.2 + 0.1 * surface, 0.0 * surface
+    found = best_threshold(jnp.stack([sure, vague, none]))
+    np.testing.assert_allclose(found, [0.5, LEAST_PROBABILITY, LEAST_PROBABILITY], atol=1e-6)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_calibrated_shape_has_the_greatest_expected_iou(soft):
+    """With truths drawn from the calibrated probabilities, no other offset is better on average."""
+    grids, offset = half_seen(), -1.0
+    if soft:
+        grids = Grids(*(x.astype(float) for x in grids[:2]))
+    logits = jnp.where(grids.occluded > 0.5, 2 * LOGITS[0], 9.0 * (2 * grids.occupied - 1))
+    truth = jax.random.bernoulli(
+        jax.random.key(2), jax.nn.sigmoid(logits + offset), (64, 16, 16, 16)
+    )
+    truth = jnp.where(grids.occluded > 0.5, truth, grids.occupied > 0.5)
+
+    def mean_iou(shape):
+        axes = (-3, -2, -1)
+        return float(jnp.mean((truth & shape).sum(axes) / (truth | shape).sum(axes)))
+
+    calibration = Calibration(offset=offset)
+    found = complete(grids, logits, symmetry=False, conditional=True, calibration=calibration)
+    others = [
+        complete(grids, logits + x, symmetry=False, conditional=True).composed
+        for x in (-1.5, -1, -0.25, 0, 0.5)
+    ]
+    assert mean_iou(found.composed) > max(map(mean_iou, others))
+    np.testing.assert_array_equal(found.logits, logits)
 
 
 def test_objects_of_a_batch_are_independent():
