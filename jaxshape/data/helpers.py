@@ -35,34 +35,41 @@ def without_helpers(parts: Sequence[Part], up: str = "y") -> tuple[list[Part], t
     left, notes = [part for part in parts if len(part.faces)], []
     for kind, named in (("collider", _COLLIDER), ("shadow", _SHADOW), ("ground", _GROUND)):
         left = _leave_out(left, kind, lambda part, named=named: _is_named(part, named), notes)
-    return _leave_out(left, "ground", lambda part: _lies_below(part, left, up), notes), tuple(notes)
+    ground = _plane_below(left, up)
+    return _leave_out(left, "ground", lambda part: part is ground, notes), tuple(notes)
 
 
 def _leave_out(
     parts: list[Part], kind: str, is_helper: Callable[[Part], bool], notes: list[str]
 ) -> list[Part]:
-    helpers = [part for part in parts if is_helper(part)]
-    if not helpers or len(helpers) == len(parts):
+    helpers, others = [], []
+    for part in parts:
+        (helpers if is_helper(part) else others).append(part)
+    if not helpers or not others:
         return parts
     names = ", ".join(sorted({repr(part.name) for part in helpers})[:3])
     notes.append(f"{kind} left out: {names}.")
-    return [part for part in parts if not any(part is helper for helper in helpers)]
+    return others
 
 
 def _is_named(part: Part, named: re.Pattern[str]) -> bool:
     return any(named.search(name) for name in part.name.split("/"))
 
 
-def _lies_below(part: Part, parts: Sequence[Part], up: str) -> bool:
-    """Whether a part is a horizontal plane below all others, and wider than they are."""
-    others = [other.vertices[np.unique(other.faces)] for other in parts if other is not part]
-    if not others:
-        return False
-    own, rest = part.vertices[np.unique(part.faces)], np.concatenate(others)
+def _plane_below(parts: Sequence[Part], up: str) -> Part | None:
+    """The part that is a horizontal plane below all others, and wider than they are, if any."""
+    if len(parts) < 2:
+        return None
     axis, sign = "xyz".index(up[-1]), -1 if up[0] == "-" else 1
-    size, rest_size = np.ptp(own, axis=0), np.ptp(rest, axis=0)
     sides = [i for i in range(3) if i != axis]
+    corners = [part.vertices[np.unique(part.faces)] for part in parts]
+    low, high = (np.stack([f(own, axis=0) for own in corners]) for f in (np.min, np.max))
+    widest = int(np.argmax((high - low)[:, sides[0]]))  # no other part can be wider than the rest
+    size = high[widest] - low[widest]
+    rest_low, rest_high = (np.delete(x, widest, axis=0) for x in (low, high))
+    rest_low, rest_high = rest_low.min(axis=0), rest_high.max(axis=0)
     thin = size[axis] <= _THIN * size[sides].min()
-    wide = (size[sides] > _WIDER * rest_size[sides]).all()
-    top = (sign * own[:, axis]).max()
-    return bool(thin and wide and top <= (sign * rest[:, axis]).min() + _THIN * size[sides].max())
+    wide = (size[sides] > _WIDER * (rest_high - rest_low)[sides]).all()
+    top, bottom = (high[widest], rest_low) if sign > 0 else (-low[widest], -rest_high)
+    below = top[axis] <= bottom[axis] + _THIN * size[sides].max()
+    return parts[widest] if thin and wide and below else None

@@ -1,5 +1,6 @@
 import os
 import pickle
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -373,6 +374,18 @@ def test_colliders_shadows_and_the_ground_are_left_out_and_named(tmp_path):
     lamp = trimesh.Scene({"seat": chair, "floor_lamp": wide})
     lamp.export(tmp_path / "a.glb")
     np.testing.assert_allclose(one(tmp_path / "a.glb").mesh.extents, [3, 3, 3], atol=1e-6)
+
+
+def test_memory_does_not_grow_with_the_number_of_parts(tmp_path, monkeypatch):
+    """SketchUp exports thousands of groups, which share one list of vertices."""
+    block = "g part{0}\nv {0} 0 0\nv {0} 1 0\nv {0} 0 1\nf -3 -2 -1\n"
+    (tmp_path / "a.obj").write_text("".join(map(block.format, range(3000))))
+    monkeypatch.setattr(archives, "MAX_BYTES", 10**6)  # reserved for the content of a file
+    tracemalloc.start()
+    model = one(tmp_path / "a.obj")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(model.mesh.faces) == 3000 and peak < 50e6
 
 
 def test_a_file_of_nothing_but_a_collider_is_kept(tmp_path):

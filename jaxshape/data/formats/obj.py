@@ -6,9 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxshape.data.formats.parts import (
+    LETTERS,
     NotSupported,
     Part,
     Unreadable,
+    checked,
     positions,
     text_of,
     without_comments,
@@ -54,7 +56,7 @@ def read_obj(content: bytes) -> list[Part]:
         elif key in ("f", "fo"):
             current.append(_Face(words[1:], len(vertices)))
         elif key in names:
-            names[key] = " ".join(words[1:])
+            names[key] = " ".join(words[1:])[:LETTERS]
             current = groups.setdefault("/".join(filter(None, names.values())), [])
         elif key in NOT_POLYGONS:
             raise NotSupported(f"The file holds {NOT_POLYGONS[key]} ({key}); export polygons.")
@@ -81,4 +83,4 @@ def _part(name: str, points: np.ndarray, faces: list[_Face]) -> Part:
     before = np.repeat([face.before for face in faces], counts)
     # Numbers below 0 count backwards from the last vertex before the face.
     indices = np.where(indices < 0, indices + before, indices - 1)
-    return Part(name, points, triangulate(points, indices, counts))
+    return checked(Part(name, points, triangulate(points, indices, counts)))

@@ -12,6 +12,10 @@ MAX_FACES = MESH_FACES
 """Largest number of triangles of one mesh, counted over all its instances in a scene."""
 
 
+LETTERS = 100
+"""Letters that are kept of each name that a file gives to its parts."""
+
+
 class Part(NamedTuple):
     """Some of the triangles of a file, with the names that the file gives them.
 
@@ -90,7 +94,9 @@ def positions(rows: list[list[str]]) -> Float[np.ndarray, "v 3"]:
 
 
 def checked(part: Part) -> Part:
-    """The part, after a check that its faces refer to existing vertices.
+    """The part with the vertices that its faces refer to, after a check that these exist.
+
+    The parts of a file may share a list of vertices, which must not be copied for each of them.
 
     Args:
         part: Faces and vertices as they were read.
@@ -98,7 +104,7 @@ def checked(part: Part) -> Part:
     Raises:
         Unreadable: A face refers to a vertex that the file does not hold.
     """
-    faces = part.faces
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(part.vertices):
+    used, faces = np.unique(part.faces, return_inverse=True)
+    if len(used) and not 0 <= used[0] <= used[-1] < len(part.vertices):
         raise Unreadable("A face refers to a vertex that the file does not hold.")
-    return part
+    return Part(part.name, part.vertices[used], faces.reshape(-1, 3))
