@@ -1,13 +1,20 @@
 """glTF 2.0: every triangle of the scene that a viewer would show, in its resting pose."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxshape.data.formats.gltf_data import GltfFile, draco_mesh, open_gltf
-from jaxshape.data.formats.parts import NotSupported, Part, Unreadable, check_faces, checked
+from jaxshape.data.formats.parts import (
+    LETTERS,
+    NotSupported,
+    Part,
+    Unreadable,
+    check_faces,
+    checked,
+)
 from jaxshape.data.formats.ply import strip_triangles
 
 UNDERSTOOD = {
@@ -23,6 +30,9 @@ HARMLESS = (
     "KHR_interactivity", "CESIUM_primitive_outline", "EXT_structural_metadata",
 )  # fmt: skip
 """Prefixes of the names of extensions that do not change shapes."""
+
+_NAMES = 32
+"""Number of nodes, the nearest ones above a mesh, that its parts are named after."""
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _NO_SURFACE = (0, 1, 2, 3)
@@ -56,14 +66,15 @@ def read_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> list[Par
             continue
         key = index if "skin" in node or "weights" in node else ("mesh", node["mesh"])
         if key not in meshes:
-            meshes[key] = list(_primitives(file, node, placed))
-        copies = (
-            [np.eye(4)]
-            if "skin" in node
-            else [placed[index] @ instance for instance in _instances(file, node)]
-        )
-        faces += len(copies) * sum(len(part.faces) for part in meshes[key])
+            made = _primitives(file, node, placed)
+            meshes[key] = [part for part in made if len(part.faces)]
+        if not meshes[key]:
+            continue
+        is_bent = "skin" in node  # then its joints place it
+        count, instances = (1, [np.eye(4)]) if is_bent else _instances(file, node)
+        faces += count * sum(len(part.faces) for part in meshes[key])
         check_faces(faces)
+        copies = [np.eye(4) if is_bent else placed[index] @ instance for instance in instances]
         parts += [_moved(part, names, matrix) for part in meshes[key] for matrix in copies]
     return parts
 
@@ -133,23 +144,21 @@ def _shown(file: GltfFile) -> Iterator[tuple[int, list[str]]]:
         node = file.entry("nodes", index)
         if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
             continue
-        names = [*above, str(node.get("name", ""))]
+        names = [*above, str(node.get("name", ""))[:LETTERS]][-_NAMES:]
         yield index, names
         waiting += [(child, names) for child in reversed(node.get("children", []))]
 
 
-def _instances(file: GltfFile, node: dict[str, Any]) -> Iterator[Matrix]:
-    """Transforms of the copies of a node's mesh in the frame of the node."""
+def _instances(file: GltfFile, node: dict[str, Any]) -> tuple[int, Iterable[Matrix]]:
+    """Number of copies of a node's mesh, and their transforms in the frame of the node."""
     about = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
     if about is None:
-        yield np.eye(4)
-        return
+        return 1, [np.eye(4)]
     given = {name: file.accessor(i) for name, i in about["attributes"].items()}
     count = max(map(len, given.values()), default=0)
     usual = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}
     rows = [given.get(name, np.tile(value, (count, 1))) for name, value in usual.items()]
-    for row in zip(*rows, strict=True):
-        yield _transform(*row)
+    return count, (_transform(*row) for row in zip(*rows, strict=True))
 
 
 # ------------------------------------------------------------------ meshes
@@ -169,7 +178,7 @@ def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> I
                 vertices = vertices + weight * file.accessor(target["POSITION"])
         if "skin" in node:
             vertices = _bent(file, node["skin"], placed, attributes, vertices)
-        yield checked(Part(str(mesh.get("name", "")), vertices, faces))
+        yield checked(Part(str(mesh.get("name", ""))[:LETTERS], vertices, faces))
 
 
 def _arrays(

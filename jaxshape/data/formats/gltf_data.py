@@ -1,13 +1,13 @@
 """The numbers of a glTF file: its chunks, buffers, accessors and Draco meshes."""
 
 import base64
-import json
 import urllib.parse
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxshape import reading
 from jaxshape.data.formats.parts import NotSupported, Unreadable
 from jaxshape.limits import MESH_BYTES
 
@@ -120,7 +120,10 @@ def open_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> GltfFile
     binary = None
     if content[:4] == b"glTF":
         content, binary = _chunks(content)
-    header = json.loads(content.decode("utf-8-sig"))
+    try:
+        header = reading.parse_json(content.decode("utf-8-sig"))
+    except ValueError as problem:
+        raise Unreadable(f"The header of the file cannot be read: {problem}.") from problem
     if not isinstance(header, dict):
         raise Unreadable("The file is no glTF: its JSON is no object.")
     version = str(header.get("asset", {}).get("version", "2.0"))
@@ -183,8 +186,9 @@ def referred(content: bytes) -> list[str]:
     if content[:1] != b"{" and content[:4] != b"\xef\xbb\xbf{":
         return []
     try:
-        uris = [about.get("uri", "data:") for about in json.loads(content).get("buffers", [])]
-    except (ValueError, RecursionError, AttributeError):  # the reader of the file reports this
+        header = reading.parse_json(content.decode("utf-8-sig"))
+        uris = [about.get("uri", "data:") for about in header.get("buffers", [])]
+    except (ValueError, AttributeError):  # the reader of the file reports this
         return []
     return [urllib.parse.unquote(uri) for uri in uris if not uri.startswith("data:")]
 

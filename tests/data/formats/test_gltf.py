@@ -92,6 +92,44 @@ def test_too_many_instances_are_refused_before_they_are_made():
         read(one(gltf.tetrahedron(indices=many), gltf, **node))
 
 
+def test_instances_without_a_face_are_passed_over():
+    """A few bytes can state millions of them."""
+    gltf = Gltf()
+    nothing = {"bufferView": gltf.view(bytes(4)), "componentType": 5125}
+    places = gltf.array(
+        np.zeros((1, 3), np.float32), count=40_000_000,
+        sparse={"count": 0, "indices": nothing, "values": nothing},
+    )  # fmt: skip
+    del gltf.header["accessors"][places]["bufferView"]
+    about = {"attributes": {"TRANSLATION": places}}
+    node = {"extensions": {"EXT_mesh_gpu_instancing": about}}
+    none = gltf.array(FACES.ravel(), count=0)
+    assert read(one(gltf.tetrahedron(indices=none), gltf, **node)) == []
+
+
+def test_parts_hold_the_vertices_of_their_faces_only():
+    """Many exporters give all primitives one list of vertices."""
+    gltf = Gltf()
+    corners = np.concatenate([CORNERS + 9, CORNERS])
+    primitive = gltf.tetrahedron(
+        attributes={"POSITION": gltf.array(corners)}, indices=gltf.array(4 + FACES.ravel())
+    )
+    (part,) = read(one(primitive, gltf))
+    np.testing.assert_array_equal(part.vertices, CORNERS)
+    np.testing.assert_array_equal(triangles([part]), WHOLE)
+
+
+def test_names_do_not_grow_with_the_depth_of_nodes():
+    gltf = Gltf()
+    gltf.header |= {
+        "meshes": [{"primitives": [gltf.tetrahedron()], "name": "m" * 5000}],
+        "nodes": [{"mesh": 0, "name": "n" * 5000, "children": [i + 1]} for i in range(99)]
+        + [{"mesh": 0, "name": "UCX_chair"}],
+    }
+    names = [part.name for part in read(gltf)]
+    assert max(map(len, names)) < 5000 and "UCX_chair" in names[-1].split("/")
+
+
 def test_a_skin_bends_the_mesh_and_forgets_its_own_place():
     """Two corners hang on a joint that has moved by (0, 0, 4), one on another joint, and one has no
     weights."""
@@ -211,6 +249,11 @@ def _no_mesh(gltf):
     gltf.header["nodes"][0]["mesh"] = -1  # which Python counts from the end
 
 
+def _deep(gltf):
+    for _ in range(99):
+        gltf.header["extras"] = [gltf.header.get("extras")]
+
+
 def _odd(gltf):
     gltf.header["accessors"][1]["count"] = 11
 
@@ -223,6 +266,7 @@ def _odd(gltf):
         (_two_parents, "child of two nodes"),
         (_no_data, "no data"),
         (_odd, "11 corners"),
+        (_deep, "nested more than 32 deep"),
         (_no_mesh, r"refers to meshes\[-1\], which it does not have"),
     ],
 )
