@@ -203,13 +203,14 @@ def _on_the_host(search: AskTell, field: _Field) -> Contestant:
         starts = zip(at.seeds, np.asarray(at.points, np.float64), at.losses.tolist(), strict=True)
         searches = [search.start(*one) for one in starts]
         stops: list[str | None] = [None] * len(searches)
-        asked, began = [one.ask() for one in searches], time.perf_counter()
+        asked = [_points_of(one.ask(), at.points.shape[1]) for one in searches]
+        began = time.perf_counter()
         nothing = np.nan * _stacked(asked, stops)
         observer.begin(at.codes, at.losses)
         jax.block_until_ready(evaluate(field.decoder, at.targets, nothing))
         compiling = time.perf_counter() - began
         observer.begin(at.codes, at.losses)
-        while None in stops:
+        for _ in range(observer.budget + 1):  # also ends a search that evaluates nothing
             losses = np.asarray(evaluate(field.decoder, at.targets, _stacked(asked, stops)))
             jax.effects_barrier()
             for i, one in enumerate(searches):
@@ -217,10 +218,23 @@ def _on_the_host(search: AskTell, field: _Field) -> Contestant:
                     said = one.tell(asked[i], losses[i, : len(asked[i])])
                     stops[i] = said or ("budget" if observer.spent[i] else None)
                 if stops[i] is None:
-                    asked[i] = one.ask()
-        return Outcome(observer, list(map(str, stops)), compiling)
+                    asked[i] = _points_of(one.ask(), at.points.shape[1])
+            if None not in stops:
+                break
+        return Outcome(observer, [str(stop or "budget") for stop in stops], compiling)
 
     return run
+
+
+def _points_of(asked: Any, d: int) -> Float[np.ndarray, "n d"]:
+    """The points that a search proposed; refuse other answers."""
+    shape = np.shape(asked)
+    if len(shape) != 2 or shape[0] < 1 or shape[1] != d:
+        raise ValueError(
+            f"ask of the search returned shape {shape}; it must return points [n, {d}], one or"
+            " more."
+        )
+    return np.asarray(asked)
 
 
 def _stacked(

@@ -39,6 +39,14 @@ CLOSE = 1e-4
 """Relative difference that is allowed between objectives from different machines."""
 
 
+_KINDS: dict[str, dict[str, Any]] = {
+    "about": {"set": str, "sha256": str, "name": str, "settings": dict, "budget": int, "seed": int},
+    "machine": {"processor": str, "cores": int, "device": str, "python": str, "packages": dict},
+    "row": {"calls": int, "seconds": (int, float), "stop": str, "code": str},
+}
+"""Types of what every entry must have; the rows have lists of numbers, too."""
+
+
 class Entry(NamedTuple):
     """The results of one method, or a part of them.
 
@@ -116,17 +124,60 @@ def read_entry(path: Path) -> Entry:
         path: The file.
 
     Raises:
-        ValueError: The file is not an entry.
+        ValueError: The file is not an entry, or a part of it is missing or of another type.
     """
     try:
-        content = reading.read_json(path)
+        content = reading.read_json_object(path)
         machines, rows = content.pop("machines"), content.pop("rows")
-        is_entry = content["format"] == FORMAT and isinstance(content["name"], str)
-    except (ValueError, KeyError, TypeError, AttributeError):
+        is_entry = content["format"] == FORMAT
+    except (ValueError, KeyError):
         is_entry = False
     if not is_entry:
         raise ValueError(f"{str(path)!r} is not an entry of the benchmark ({FORMAT}).")
+    try:
+        _require("about", content)
+        for machine in machines.values():
+            _require("machine", machine)
+        require_rows(rows)
+    except (ValueError, KeyError, TypeError, AttributeError) as problem:
+        raise ValueError(
+            f"{str(path)!r} is a damaged entry of the benchmark: a part of it is missing or"
+            f" malformed ({problem})."
+        ) from problem
     return Entry(content, machines, rows)
+
+
+def require_rows(rows: dict[str, Row]) -> None:
+    """Refuse rows of which a figure is missing, or of another type or shape.
+
+    Args:
+        rows: Results by the names of the problems.
+
+    Raises:
+        ValueError: A row is none, or lacks a figure.
+    """
+    for name, row in rows.items():
+        try:
+            _require_figures(row)
+        except (ValueError, KeyError, TypeError, AttributeError) as problem:
+            raise ValueError(f"row {name}: {problem}") from problem
+
+
+def _require_figures(row: Row) -> None:
+    _require("row", row)
+    for name in ("objective", "iou"):
+        reading.numbers_of(row[name], (len(LADDER),))
+    reached = reading.numbers_of(row["reached"], (-1, 2))
+    if not len(row["reached"]) == len(reached) <= len(LEFT):
+        raise ValueError(f"reached is not of pairs, for {len(LEFT)} targets at most")
+    if row.get("load") is not None:
+        reading.numbers_of(row["load"], ())
+
+
+def _require(part: str, content: dict[str, Any]) -> None:
+    for name, kind in _KINDS[part].items():
+        if isinstance(content[name], bool) or not isinstance(content[name], kind):
+            raise ValueError(f"{name} is {content[name]!r:.60}")
 
 
 def read_entries(paths: Iterable[Path]) -> list[Entry]:

@@ -14,7 +14,14 @@ from jaxtyping import Array, Float, Int
 
 from jaxshape import checks
 from jaxshape.bench.config import BUDGETS, LADDER
-from jaxshape.bench.entries import file_name, new_entry, read_entry, with_rows, write_entry
+from jaxshape.bench.entries import (
+    file_name,
+    new_entry,
+    read_entry,
+    require_rows,
+    with_rows,
+    write_entry,
+)
 from jaxshape.bench.problems import Problem, objectives, stacked_targets
 from jaxshape.bench.scoring import Row, rows_of
 from jaxshape.bench.watching import Observer, watched
@@ -140,7 +147,12 @@ def enter_benchmark(
     """
     _require_complete(rows, budget)
     path = Path(folder) / file_name(name)
-    entry = new_entry(name, settings=settings, budget=budget, seed=seed)
+    try:
+        entry = new_entry(name, settings=settings, budget=budget, seed=seed)
+    except TypeError as problem:
+        raise ValueError(
+            f"JSON cannot hold the settings, name, budget or seed ({problem})."
+        ) from None
     before = read_entry(path) if path.exists() else entry
     if before.about != entry.about:
         raise ValueError(f"{str(path)!r} holds results of other settings; give another name.")
@@ -153,6 +165,12 @@ def _require_complete(rows: dict[str, Row], budget: int) -> None:
     """Refuse rows that would claim another budget than the one that was watched."""
     if not rows:
         raise ValueError("There are no rows; give those of a watch, watch.rows().")
+    try:
+        require_rows(rows)
+    except (ValueError, AttributeError) as problem:
+        raise ValueError(
+            f"The rows are not those of a watch, watch.rows() ({problem})."
+        ) from problem
     for name, row in rows.items():
         if row["stop"] == "budget" and row["calls"] < budget:
             raise ValueError(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxshape import checks
 from jaxshape.bench.config import FRAMES, KINDS
 from jaxshape.bench.problem_set import ProblemSet, packaged_set
 from jaxshape.data.dataset import unpack, unpack_measured
@@ -129,6 +130,7 @@ def problems(
         ValueError: The set has no such objects, frames or kinds, or it was made for other weights.
     """
     found = packaged_set() if problem_set is None else problem_set
+    checks.instance("problem_set", found, ProblemSet, "read_set")
     count = len(found.objects) if objects is None else objects
     is_count = isinstance(count, Integral) and count >= 1
     if not (is_count and _are_among(frames, FRAMES) and _are_among(kinds, KINDS)):

@@ -57,9 +57,14 @@ def run(
         The progress, for each method at its start and after each batch.
 
     Raises:
-        ValueError: The method is unknown, or the folder holds results of the same method with other
-            settings.
+        ValueError: There is no problem, the method is unknown, or the folder holds results of the
+            same method with other settings, or of another method in the file of this one.
     """
+    if not problems:
+        raise ValueError(
+            "No problem is left for this part; choose more problems, or divide them into fewer"
+            " parts."
+        )
     settings = config.search()
     searches = {one: contestant(one, problems[0], settings, config.budget) for one in methods}
     for method, (search, alone) in searches.items():
@@ -73,7 +78,13 @@ def run(
         )
         path = folder / file_name(name, part)
         done = _rows_in(folder, entry)
-        entry = read_entry(path) if path.exists() else entry
+        before = read_entry(path) if path.exists() else entry
+        if before.about != entry.about:
+            raise ValueError(
+                f"{str(path)!r} holds results of {before.about['name']!r}; rename this file to add"
+                f" those of {name!r}."
+            )
+        entry = before
         left = [one for one in problems if one.name not in done]
         yield BenchProgress(name, len(problems) - len(left), len(problems))
         size = 1 if alone else min(config.at_a_time, max(1, len(left)))

@@ -91,7 +91,7 @@ def standings(entries: Sequence[Entry], best: dict[str, float]) -> list[Standing
     Raises:
         ValueError: No problem is common to all.
     """
-    names = shared_problems(entries)
+    names = [name for name in shared_problems(entries) if name in best]
     if not names:
         raise ValueError(
             "No problem has results of all entries, so they cannot be compared; run the"

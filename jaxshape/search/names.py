@@ -11,6 +11,7 @@ does not know; `variant` is None for a name without one.
 
 import importlib
 import importlib.util
+import inspect
 import pkgutil
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
@@ -85,4 +86,13 @@ def _imported(name: str, module: str, function: str) -> Build:
         raise ValueError(
             f"The method {name!r} cannot be imported: {module} has no function {function!r}."
         )
+    try:
+        inspect.signature(found).bind("variant", 1, "config")
+    except TypeError as error:
+        raise ValueError(
+            f"The method {name!r} is no search: {function} takes other arguments than (variant,"
+            f" dim, config) ({error})."
+        ) from error
+    except ValueError:  # Python does not know the arguments of some functions
+        pass
     return found

@@ -43,6 +43,9 @@ def test_problems_that_some_have_not_searched_are_left_out(rows, tiny_set):
     some = dict(list(rows(1.0).items())[:1])
     entries = [with_rows(new_entry("all"), rows(1.0)), with_rows(new_entry("some"), some)]
     assert [len(one.calls) for one in standings(entries, tiny_set.best)] == [1, 1]
+    unknown = new_entry("other")._replace(rows={"nothing/4/clean": {}})
+    with pytest.raises(ValueError, match="No problem has results of all"):
+        standings([unknown], tiny_set.best)
     with pytest.raises(ValueError, match="No problem has results of all"):
         standings([*entries, new_entry("none")], tiny_set.best)
 

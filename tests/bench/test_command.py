@@ -59,6 +59,7 @@ def test_a_loop_of_ones_own_enters(run, elsewhere, two, monkeypatch):
     "options, told",
     [
         (("--part", "5/4"), "--part is '5/4'; give I/N"),
+        (("--part", "8/9"), "No problem is left for this part"),
         (("--frames", "2"), "frames among 1, 4, 8"),
         (("--methods", "nothing"), "There is no method 'nothing'"),
         (("--methods", "nevergrad:No"), "nevergrad"),

@@ -94,3 +94,39 @@ def test_a_search_on_the_host_goes_by_its_import_path(two, tmp_path, monkeypatch
             contestant("halving_stranger:wrong", two[0], CONFIG, 64)
     finally:
         sys.modules.pop("halving_stranger", None)
+
+
+ODD = """
+import numpy as np
+import jaxshape as js
+
+def asks(points):
+    class Search:
+        def __init__(self, seed, point, loss):
+            self.point = point
+
+        def ask(self):
+            return points(self.point)
+
+        def tell(self, points, losses):
+            return None
+
+    return lambda variant, dim, config: js.AskTell(Search)
+
+nothing = asks(lambda point: point[None][:0])
+one = asks(lambda point: point)
+lost = asks(lambda point: np.nan * point[None])
+"""
+
+
+def test_a_search_on_the_host_that_proposes_no_points_ends(two, tmp_path, monkeypatch):
+    (tmp_path / "odd_stranger.py").write_text(ODD)
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        for name, shape in {"nothing": r"\(0, 10\)", "one": r"\(10,\)"}.items():
+            with pytest.raises(ValueError, match=f"returned shape {shape}; it must return points"):
+                searched(f"odd_stranger:{name}", two)
+        rows, _ = searched("odd_stranger:lost", two)
+        assert [(row["calls"], row["stop"]) for row in rows.values()] == [(0, "budget")] * 2
+    finally:
+        sys.modules.pop("odd_stranger", None)

@@ -115,6 +115,34 @@ def test_a_file_that_is_no_entry_is_told(tmp_path):
             read_entry(tmp_path / "x.json")
 
 
+@pytest.mark.parametrize(
+    "damage, told",
+    [
+        (lambda e: e.about.pop("set"), "set"),
+        (lambda e: e.about.update(budget="64"), "budget is '64'"),
+        (lambda e: e.machines.update(here={}), "processor"),
+        (lambda e: e.rows.update(one=None), "row one"),
+        (lambda e: e.rows.update(one=e.rows[next(iter(e.rows))] | {"iou": [None] * 10}), "number"),
+        (lambda e: e.rows.update(one=e.rows[next(iter(e.rows))] | {"reached": [[]]}), "pairs"),
+    ],
+)
+def test_a_damaged_entry_is_told(entry, tmp_path, damage, told):
+    """Entries come from others, and are drawn before they are checked."""
+    damaged = copy.deepcopy(entry)
+    damage(damaged)
+    write_entry(tmp_path / "x.json", damaged)
+    with pytest.raises(ValueError, match=f"x.json' is a damaged entry.*{told}"):
+        read_entry(tmp_path / "x.json")
+
+
+def test_a_file_of_another_method_is_not_written_to(entry, two, tmp_path):
+    """Different names may become the same file."""
+    other = entry._replace(about=entry.about | {"name": "gradient/adam"})
+    write_entry(tmp_path / "gradient_adam.json", other)
+    with pytest.raises(ValueError, match="holds results of 'gradient/adam'; rename this file"):
+        list(run(["gradient:adam"], two, CONFIG, tmp_path))
+
+
 def test_names_become_safe_files():
     assert file_name("evosax:Open_ES@18 sigma0=0.2") == "evosax_Open_ES@18_sigma0=0.2.json"
     assert file_name("../../x", "2/3") == "x.part-2-of-3.json"
@@ -127,5 +155,13 @@ def test_rows_that_contradict_their_budget_are_refused(two, tmp_path):
     for rows, said in (({}, "There are no rows"), (watch.rows(), "0 decoder calls, but budget is")):
         with pytest.raises(ValueError, match=said):
             enter_benchmark(tmp_path, "own", rows)
-    path = enter_benchmark(tmp_path, "own", watch.rows("converged"), budget=64)
+    rows = watch.rows("converged")
+    incomplete = {name: {"calls": 3} for name in rows}
+    for given, settings, said in (
+        (incomplete, {}, "not those of a watch"),
+        (rows, {"a": {1}}, "JSON"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            enter_benchmark(tmp_path, "own", given, settings=settings, budget=64)
+    path = enter_benchmark(tmp_path, "own", rows, budget=64)
     assert set(read_entry(path).rows) == {one.name for one in two}

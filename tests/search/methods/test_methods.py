@@ -78,6 +78,9 @@ def build(variant, dim, config):
 def nothing(variant, dim, config):
     return None
 
+def short(dim):
+    return None
+
 number = 3
 """
 
@@ -134,6 +137,7 @@ def test_an_entry_point_goes_by_its_name_like_a_family(package):
         ("their_package.searches:number", "their_package.searches has no function 'number'"),
         ("their_package.searches:nothing", "returned NoneType; it must return a jaxshape.Refiner"),
         ("their_package.searches:build@long", "There is no long."),
+        ("their_package.searches:short", "short takes other arguments than .variant, dim, config"),
         ("their_package.searches", "no method 'their_package.searches'.* package.module:function"),
     ],
 )
