@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxshape import reading
 from jaxshape.data import dataset, meshes
 from jaxshape.data.archives import MeshSource
 from jaxshape.data.config import DatasetConfig
@@ -164,9 +165,10 @@ def _claim(folder: Path, objects: Sequence[Object], config: DatasetConfig) -> No
     path = folder / "dataset.json"
     if not path.exists():
         return write_json(path, claim)
-    found = json.loads(path.read_text())
+    found = dataset.read_part(path)
     # Older datasets lack newer settings; they were made with the present defaults.
-    known = {"config": json.loads(json.dumps(asdict(DatasetConfig()))) | found.get("config", {})}
+    usual, given = json.loads(json.dumps(asdict(DatasetConfig()))), found.get("config", {})
+    known = {"config": usual | given if isinstance(given, dict) else given}
     if found | known != claim:
         raise DatasetError(
             f"{str(folder)!r} already holds a dataset of other objects or settings; "
@@ -205,11 +207,16 @@ def _write_part(folder: Path, number: int, record: Record) -> None:
 
 
 def _read_part(folder: Path, number: int) -> Record | None:
-    path = _part_path(folder, number, "json")
-    if not path.exists():
+    """The record of an object; None if its part is missing or damaged."""
+    try:
+        found = reading.read_json(_part_path(folder, number, "json"))
+        name, content, notes, skipped = found
+        if skipped is None:
+            arrays = reading.array_names(_part_path(folder, number, "npz"))
+            return Record(name, content, tuple(notes), None) if arrays >= set(KINDS) else None
+        return Record(name, content, tuple(notes), Skipped(*skipped))
+    except (OSError, ValueError, TypeError):
         return None
-    name, content, notes, skipped = json.loads(path.read_text())
-    return Record(name, content, tuple(notes), skipped and Skipped(*skipped))
 
 
 # ------------------------------------------------------------------ shards
@@ -255,14 +262,22 @@ def _remove_parts(folder: Path, numbers: Iterable[int]) -> None:
 def _finished(
     folder: Path, shard: int, items: Sequence[Object]
 ) -> tuple[list[Skipped], list[tuple[str, str]]] | None:
-    """The skipped objects and the notes of a shard; None if the shard has to be made."""
+    """The skipped objects and the notes of a shard; None if the shard has to be made, or is damaged
+    and has to be made again."""
     path = shard_path(folder, shard, "json")
     if not path.exists():
         return None
-    found = json.loads(path.read_text())
-    contents = found.get("contents", [""] * len(items))  # old datasets have no contents
-    if any(content not in ("", content_of(item))
-           for content, item in zip(contents, items, strict=True)):  # fmt: skip
-        path.unlink()
-        return None
-    return [Skipped(*one) for one in found["skipped"]], [(a, b) for a, b in found.get("notes", [])]
+    try:
+        found, _ = dataset.open_shard(folder, shard)
+        contents = found.get("contents", [""] * len(items))  # old datasets have no contents
+        skipped = [Skipped(*one) for one in found["skipped"]]
+        notes = [(a, b) for a, b in found.get("notes", [])]
+        is_whole = len(found["names"]) + len(skipped) == len(items) and all(
+            content in ("", content_of(item)) for content, item in zip(contents, items, strict=True)
+        )
+    except (DatasetError, KeyError, TypeError, ValueError):
+        is_whole = False
+    if is_whole:
+        return skipped, notes
+    path.unlink()
+    return None

@@ -189,7 +189,7 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     folder = Path(folder)
     if not (folder / "dataset.json").exists():
         raise DatasetError(f"There is no dataset in {str(folder)!r}; make one: jaxshape dataset.")
-    claim = _read(folder / "dataset.json")
+    claim = read_part(folder / "dataset.json")
     if claim.get("format") != FORMAT:
         raise DatasetError(
             f"{str(folder)!r} holds a dataset of an earlier version of jaxshape; build it again: "
@@ -208,37 +208,66 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     names, row = [], []
     arrays: dict[str, list[np.ndarray]] = {kind: [] for kind in KINDS}
     for number in range(expected):
-        inside = _read(shard_path(folder, number, "json")).get("names", [])
-        names += inside
-        row += [(number, place) for place in range(len(inside))]
+        about, found = open_shard(folder, number)
+        names += about["names"]
+        row += [(number, place) for place in range(len(about["names"]))]
         for kind in KINDS:
-            arrays[kind].append(_mapped(shard_path(folder, number, f"{kind}.npy"), len(inside)))
+            arrays[kind].append(found[kind])
     if not names:
         raise DatasetError(f"Every object of the dataset in {str(folder)!r} was skipped.")
     return Dataset(names, arrays["surface"], arrays["measured"], row)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def open_shard(folder: Path, number: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The content of the JSON file of a shard, and its memory-mapped arrays by kind.
+
+    Args:
+        folder: Folder of the dataset.
+        number: Number of the shard.
+
+    Raises:
+        DatasetError: A file is missing or damaged, or they do not belong together.
+    """
+    path = shard_path(folder, number, "json")
+    about = read_part(path)
+    names = about.get("names")
+    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        raise _damaged(path, "it has no names of objects")
+    surface, measured = (_mapped(shard_path(folder, number, f"{kind}.npy")) for kind in KINDS)
+    for kind, array, axes in (("surface", surface, 3), ("measured", measured, 4)):
+        if array.dtype != np.uint8 or array.ndim != axes or len(array) != len(names):
+            raise _damaged(
+                shard_path(folder, number, f"{kind}.npy"),
+                f"it holds {array.shape} {array.dtype}, its shard has {len(names)} objects",
+            )
+    if measured.shape[1::2] != (surface.shape[1], 8 * surface.shape[2]):
+        raise _damaged(path, f"its arrays have shapes {surface.shape} and {measured.shape}")
+    return about, {"surface": surface, "measured": measured}
+
+
+def read_part(path: Path) -> dict[str, Any]:
+    """The object in a JSON file of a dataset.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: It cannot be read.
+    """
     try:
         return reading.read_json_object(path)
     except (OSError, ValueError) as problem:
-        raise DatasetError(
-            f"{str(path)!r} is damaged ({problem}); build the dataset again."
-        ) from None
+        raise _damaged(path, problem) from None
 
 
-def _mapped(path: Path, count: int) -> np.ndarray:
-    """Memory-map the array of a shard of `count` objects."""
+def _mapped(path: Path) -> np.ndarray:
     try:
-        array = np.load(path, mmap_mode="r")
-    except (OSError, ValueError) as problem:
-        raise DatasetError(
-            f"{str(path)!r} is damaged ({problem}); build the dataset again."
-        ) from None
-    if array.dtype != np.uint8 or len(array) != count:
-        raise _damaged(path, f"it holds {array.shape} {array.dtype}, its shard has {count} objects")
-    return array
+        return np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError, EOFError) as problem:
+        raise _damaged(path, problem) from None
 
 
 def _damaged(path: Path, problem: Any) -> DatasetError:
-    return DatasetError(f"{str(path)!r} is damaged ({problem}); build the dataset again.")
+    return DatasetError(
+        f"{str(path)!r} is damaged ({problem}); remove it and build the dataset again."
+    )

@@ -163,6 +163,36 @@ def test_a_shard_whose_names_are_missing_is_made_anew(objects, built, copied):
     assert (copied / "shard-00000.surface.npy").stat().st_mtime_ns == untouched.st_mtime_ns
 
 
+@pytest.mark.parametrize("content", [None, b"", b"{", b"{}", b'{"names": 5, "skipped": []}'])
+@pytest.mark.parametrize("name", ["json", "surface.npy", "measured.npy"])
+def test_a_damaged_shard_is_made_again(objects, built, copied, name, content):
+    """The remedy that its message names: build the dataset again."""
+    damaged = copied / f"shard-00001.{name}"
+    damaged.unlink()
+    if content is not None:
+        damaged.write_bytes(content)
+    with pytest.raises(DatasetError, match="shard"):
+        open_dataset(copied)
+    build_here(copied, objects)
+    assert contents(copied) == contents(built[0])
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '["000", "", [], null]'])
+def test_a_damaged_part_is_made_again(objects, tmp_path, content):
+    """The last one is the record of an object whose arrays are missing."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "00000000.json").write_text(content)
+    build_here(tmp_path, objects[:1])
+    assert open_dataset(tmp_path).names == ["000"]
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"config": null}'])
+def test_a_build_over_a_damaged_claim_is_refused(objects, copied, content):
+    (copied / "dataset.json").write_text(content)
+    with pytest.raises(DatasetError, match="remove it and build|other objects or settings"):
+        build_here(copied, objects)
+
+
 def test_parts_of_a_written_shard_are_removed(objects, built, copied):
     """The kill came while the parts of the second shard were being removed."""
     left = building._part_path(copied, OBJECTS_PER_SHARD, "json")
@@ -270,6 +300,7 @@ def test_a_dataset_of_an_earlier_version_is_named(copied):
         ("dataset.json", b'{"format": "' + FORMAT.encode() + b'", "objects": -4}'),
         ("shard-00000.json", b"[" * 100_000),
         ("shard-00000.surface.npy", b"no array"),
+        ("shard-00000.surface.npy", b""),
     ],
 )
 def test_a_damaged_file_is_named(copied, name, content):
