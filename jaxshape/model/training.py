@@ -5,6 +5,7 @@ everything that is needed to resume. A run that was killed and resumed ends with
 an uninterrupted one, because batches depend only on the seed and the step.
 """
 
+import hashlib
 import json
 import os
 import time
@@ -269,8 +270,9 @@ def train(
         A report after every `config.report_every` steps and after the last.
 
     Raises:
-        ValueError: The folder holds a run of other settings, the resolutions differ, the weights to
-            start from do not fit, or a batch cannot be divided among the devices.
+        ValueError: The folder holds a run of other settings or on other pairs, the resolutions
+            differ, the weights to start from do not fit, or a batch cannot be divided among the
+            devices.
     """
     folder = Path(folder)
     if dataset.resolution != config.architecture.resolution:
@@ -288,7 +290,7 @@ def train(
     mesh = jax.make_mesh((devices,), ("batch",))
     whole, spread = NamedSharding(mesh, P()), NamedSharding(mesh, P("batch"))
     share = partial(jax.make_array_from_process_local_data, whole)
-    run = _identity(config, start)
+    run = _identity(config, start, dataset)
     state = jax.tree.map(share, _agreed_state(folder, run, config, start))
     step_fn = _parallel_step(config, mesh)
     kept = validation_batch(dataset, config)
@@ -379,9 +381,12 @@ def save_checkpoint(folder: Path, state: TrainState, run: str) -> None:
         save_file(tensors, temporary, {"run": run})
 
 
-def _identity(config: TrainConfig, start: ShapePrior | None) -> str:
-    """Settings and start of a run, as text; its checkpoint must have the same."""
-    return json.dumps(asdict(config) | {"start": start and fingerprint(start)})
+def _identity(config: TrainConfig, start: ShapePrior | None, dataset: Dataset) -> str:
+    """Settings, start and pairs of a run, as text; its checkpoint must have the same."""
+    pairs = hashlib.sha256("\n".join(dataset.names).encode())
+    pairs.update(np.asarray(dataset.measured[0][:1]).tobytes())  # depends on all of its settings
+    more = {"start": start and fingerprint(start), "pairs": pairs.hexdigest()}
+    return json.dumps(asdict(config) | more)
 
 
 def _agreed_state(
@@ -395,9 +400,9 @@ def _agreed_state(
     share, is_first = multihost_utils.broadcast_one_to_all, jax.process_index() == 0
     path = folder / "checkpoint.safetensors"
     is_there = is_first and path.exists()
-    if share(is_there and _run_of(path) != run):
+    if share(is_there and not _is_of(path, run)):
         raise ValueError(
-            f"{str(folder)!r} holds a training run of other settings; "
+            f"{str(folder)!r} holds a training run of other settings, or on another dataset; "
             "give the same ones to resume it, or another folder."
         )
     if is_first:
@@ -406,9 +411,12 @@ def _agreed_state(
     return share(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))
 
 
-def _run_of(checkpoint: Path) -> str | None:
+def _is_of(checkpoint: Path, run: str) -> bool:
+    """Whether a checkpoint is of a run; those of earlier versions do not name their pairs."""
+    wanted = json.loads(run)
     with _opened(checkpoint) as file:
-        return (file.metadata() or {}).get("run")
+        found = reading.parse_json((file.metadata() or {}).get("run", "null"))
+    return found in (wanted, {name: x for name, x in wanted.items() if name != "pairs"})
 
 
 @contextmanager

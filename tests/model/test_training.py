@@ -1,3 +1,4 @@
+import json
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -279,6 +280,24 @@ def test_a_run_of_other_settings_or_another_start_is_refused(dataset, whole_run,
     for config, begin in ((replace(CONFIG, seed=1), prior), (CONFIG, None), (CONFIG, other)):
         with pytest.raises(ValueError, match="training run of other settings"):
             next(training.train(whole_run.folder, dataset, config, begin))
+
+
+def test_a_run_on_another_dataset_is_refused(dataset, whole_run, start):
+    """Its weights would be those of the first dataset, under the name of the second."""
+    renamed = dataset._replace(names=[f"table {name}" for name in dataset.names])
+    other = dataset._replace(measured=[np.asarray(x)[:, ::-1] for x in dataset.measured])
+    for pairs in (renamed, other):
+        with pytest.raises(ValueError, match="on another dataset"):
+            list(training.train(whole_run.folder, pairs, CONFIG, load_prior(start)))
+
+
+def test_a_checkpoint_that_does_not_name_its_pairs_is_resumed(dataset, whole_run, start, tmp_path):
+    """As earlier versions wrote them."""
+    run = json.loads(training._identity(CONFIG, load_prior(start), dataset))
+    del run["pairs"]
+    state = training._read_checkpoint(whole_run.folder / "checkpoint.safetensors", CONFIG)
+    training.save_checkpoint(tmp_path, state, json.dumps(run))
+    assert list(training.train(tmp_path, dataset, CONFIG, load_prior(start))) == []
 
 
 def test_a_run_starts_with_a_copy_of_the_weights_it_is_given(start):
