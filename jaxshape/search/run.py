@@ -1,5 +1,6 @@
 """Refinement: the searches of many objects in one compiled program (the loop is in `loop`)."""
 
+import math
 from typing import Any, NamedTuple, get_args
 
 import jax
@@ -124,6 +125,14 @@ def refine(
     require_types(prior, refiner, residual)
     checks.whole("iterations", iterations, 1)
     checks.one_of("precision", precision, get_args(Precision))
+    checks.at_least("penalty_weight", penalty_weight, 0)
+    if target_loss is not None:
+        checks.within("target_loss", target_loss, -math.inf, math.inf)
+    if space is not None:
+        checks.instance("space", space, LatentSpace, "whitened(prior)")
+    for name, function in (("penalty", penalty), ("callback", callback)):
+        if not (function is None or callable(function)):
+            checks.refuse(name, function, "a function, or None")
     if previous is not None:
         checks.instance("previous", previous, Refined, "refine")
     if previous is not None and warm_start is not None:

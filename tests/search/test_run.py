@@ -390,6 +390,11 @@ def test_a_search_that_breaks_its_promise_is_told_which(counted, name, change, s
             {"first_losses": 1.0},
             r"first_losses has an array of shape \(\), but there are 3 objects",
         ),
+        ({"penalty_weight": -1.0}, "penalty_weight is -1.0; give a number, 0 or more"),
+        ({"target_loss": float("nan")}, "target_loss is nan; give a number"),
+        ({"space": "raw"}, "space is of type str; give a LatentSpace, as whitened"),
+        ({"penalty": 0.1}, "penalty is 0.1; give a function, or None"),
+        ({"callback": "print"}, "callback is 'print'; give a function, or None"),
         ({"penalty": lambda code: code}, r"penalty must return one .* float32 of shape \(4,\)"),
     ],
 )
