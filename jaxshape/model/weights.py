@@ -102,6 +102,9 @@ def save_prior(
         card: The model card: a dictionary of anything that JSON can hold.
         in_bytes: Round the weights of each channel to 1/127 of the largest one, instead of to half
             precision. The file is half as large, and our networks lose less than 0.001 of IoU.
+
+    Raises:
+        ValueError: JSON cannot hold the card; nothing is written.
     """
     tensors = {}
     for name, x in flatten(prior.params).items():
@@ -115,7 +118,10 @@ def save_prior(
     if prior.calibration is not None:
         tensors["calibration"] = np.asarray(prior.calibration, np.float32)
     form = FORMAT_IN_BYTES if in_bytes else FORMAT
-    metadata = {"format": form, "kind": prior.model.kind, "card": json.dumps(card)}
+    try:
+        metadata = {"format": form, "kind": prior.model.kind, "card": json.dumps(card)}
+    except TypeError as problem:
+        raise ValueError(f"JSON cannot hold the card ({problem}); give plain numbers.") from None
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata)
 
@@ -155,6 +161,7 @@ def load_prior(
     # Converted by NumPy: JAX would compile a program for each shape.
     with np.errstate(over="ignore"):  # values that overflow are found to be infinite below
         named = {name: jnp.asarray(x) for name, x in _weights(tensors, where).items()}
+        mean, covariance = (None if x is None else x.astype(np.float32) for x in (mean, covariance))
     try:
         params = unflatten(named)
     except (TypeError, ValueError) as problem:
@@ -207,7 +214,10 @@ def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
     """
     where = _path(path)
     try:
-        return reading.parse_json(_read(where)[1].get("card", "{}"))
+        card = reading.parse_json(_read(where)[1].get("card", "{}"))
+        if not isinstance(card, dict):
+            raise ValueError(f"it is a JSON {type(card).__name__}, not an object")
+        return card
     except WeightsError:
         raise
     except ValueError as problem:

@@ -111,6 +111,8 @@ def _read(path: Path) -> dict[str, Any]:
         kinds = {"settings": dict, "rows": dict, "seconds": (int, float)}
         if wrong := [name for name, kind in kinds.items() if not isinstance(content[name], kind)]:
             raise ValueError(f"its {wrong[0]} are damaged")
+        if not all(isinstance(row, dict) for row in content["rows"].values()):
+            raise ValueError("one of its rows is damaged")
     except (OSError, ValueError, KeyError) as problem:
         raise ValueError(
             f"{str(path)!r} cannot be resumed ({problem}); remove it to start over."

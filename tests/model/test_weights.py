@@ -222,13 +222,23 @@ def test_numbers_that_are_not_finite_are_refused(name, value, rewritten):
         load_prior(path)
 
 
-@pytest.mark.parametrize("factor", [0, -1])
+@pytest.mark.parametrize("factor", [0, -1, 1e-300])
 def test_a_covariance_that_is_none_is_refused(factor, rewritten):
-    path = rewritten(
-        lambda tensors: tensors.update(code_covariance=np.float32(factor * np.eye(10)))
-    )
+    path = rewritten(lambda tensors: tensors.update(code_covariance=factor * np.eye(10)))
     with pytest.raises(WeightsError, match="not symmetric and positive definite"):
         load_prior(path)
+
+
+def test_statistics_that_single_precision_cannot_hold_are_refused(rewritten):
+    path = rewritten(lambda tensors: tensors.update(code_covariance=1e300 * np.eye(10)))
+    with pytest.raises(WeightsError, match="code_covariance holds NaN or infinity"):
+        load_prior(path)
+
+
+def test_a_card_that_json_cannot_hold_is_refused(prior, tmp_path):
+    with pytest.raises(ValueError, match="JSON cannot hold the card"):
+        save_prior(tmp_path / "a.safetensors", prior, {"iou": np.float32(0.5)})
+    assert not list(tmp_path.iterdir())
 
 
 def test_large_parameters_are_not_lost_in_half_precision(tmp_path):

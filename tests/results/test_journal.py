@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from jaxshape.results.journal import Journal
 
 SETTINGS = {"frames": (1, 4), "iterations": 60}
@@ -44,3 +46,11 @@ def test_many_short_rows_take_time_too_and_a_removed_journal_is_empty(tmp_path):
     again.remove()
     again.remove()
     assert Journal(journal.path, SETTINGS).rows == {} and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("row", ["5", "null", "[]"])
+def test_a_damaged_row_is_told(tmp_path, row):
+    path = tmp_path / "study.json"
+    path.write_text(f'{{"settings": {{}}, "seconds": 1, "rows": {{"a": {row}}}}}')
+    with pytest.raises(ValueError, match="study.json' cannot be resumed .one of its rows"):
+        Journal(path, {})
