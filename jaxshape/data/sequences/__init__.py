@@ -25,6 +25,7 @@ from jaxshape import limits
 from jaxshape.data.sequences.cameras import (
     Camera,
     default_camera,
+    distorted,
     find_camera,
     guessed,
     other_cameras,
@@ -135,12 +136,12 @@ def open_sequence(
             f"The depth scale is {scale:g}; expected the number of depth units in a metre, which "
             "is positive: 1000 for millimetres."
         )
-    has_poses, is_guess = listed.read_pose is not None, bool(doubts)
-    is_default = listed.camera is not None and camera.source == listed.camera.source
+    has_poses = listed.read_pose is not None
+    default = listed.camera if listed.camera and camera.source == listed.camera.source else None
     doubts += (
         *other_cameras(camera, contents.folder, contents.files, shape),
         *unmatched(contents, listed),
-        *unread(contents, has_poses=has_poses, has_camera=not is_default, earlier=listed.findings),
+        *unread(contents, has_poses=has_poses, has_camera=default is None, earlier=listed.findings),
     )
     files, remarks = _without_other_colors(listed, shape)
     return Sequence(
@@ -156,7 +157,7 @@ def open_sequence(
         color_delays=listed.color_delays,
         findings=listed.findings + doubts + remarks,
         cameras=cameras,
-        camera_is_guess=is_guess,
+        camera_is_guess=default is not None and not default.sure,
     )
 
 
@@ -253,14 +254,15 @@ def _camera(
     beside = list_folder(contents.folder).files  # also beside a file that is a recording by itself
     camera = find_camera(contents.folder, beside, shape)
     if camera is not None:
-        return camera, ()
+        return camera, distorted(camera.distortion, camera.source)
     if listed.camera is None:
         raise SequenceError(
             f"camera-intrinsics.txt is missing; expected the 3x3 camera matrix in "
             f"{contents.folder} or in its parent folder: write it there."
         )
     camera = default_camera(listed.camera, contents.folder, shape)
-    return camera, () if listed.camera.sure else (guessed(camera),)
+    doubts = () if listed.camera.sure else (guessed(camera),)
+    return camera, (*doubts, *distorted(camera.distortion, camera.source))
 
 
 def _without_other_colors(

@@ -31,11 +31,13 @@ class Camera(NamedTuple):
         intrinsics: Camera matrix, in pixels.
         source: Source of the intrinsics.
         depth_scale: Depth units per metre that the source states; None if it does not.
+        distortion: Numbers of the lens distortion that the source states.
     """
 
     intrinsics: Float[np.ndarray, "3 3"]
     source: str
     depth_scale: float | None = None
+    distortion: tuple[float, ...] = ()
 
 
 class Calibration(NamedTuple):
@@ -62,12 +64,17 @@ class DefaultCamera(NamedTuple):
         source: Source of the numbers.
         sure: Whether the camera is known to be that of this very recording; otherwise it is a
             guess.
+        distortion: Numbers of its lens distortion.
     """
 
     numbers: tuple[float, float, float, float]
     source: str
     sure: bool
+    distortion: tuple[float, ...] = ()
 
+
+_BENT = 0.01
+"""Least number of a lens distortion that is remarked; it moves the corners of an image by 0.5 %."""
 
 PRIMESENSE = (525.0, 525.0, 319.5, 239.5)
 """Default of the drivers of Kinect 1 and Asus Xtion, and of ROS and Open3D."""
@@ -76,9 +83,10 @@ PRIMESENSE = (525.0, 525.0, 319.5, 239.5)
 def find_camera(folder: Path, names: Iterable[str], shape: tuple[int, int]) -> Camera | None:
     """The camera file in a folder with the files `names`, or in its parent; None without one.
 
-    It may be `camera-intrinsics.txt` or `cam_K.txt` (3x3), `calibration.txt` (fx fy cx cy), or a
-    camera or trajectory of Open3D with "camera", "intrinsic" or "traj" in its name, which is scaled
-    to `shape` if its size differs. The first of them counts; of Open3D's, one of the depth images.
+    It may be `camera-intrinsics.txt` or `cam_K.txt` (3x3), `calibration.txt` (fx fy cx cy, or 3x3),
+    or a camera or trajectory of Open3D with "camera", "intrinsic" or "traj" in its name, which is
+    scaled to `shape` if its size differs. The first of them counts; of Open3D's, one of the depth
+    images.
     """
     for name in _camera_files(names):
         if (camera := _read_camera(folder / name, shape)) is not None:
@@ -123,7 +131,8 @@ def _camera_files(names: Iterable[str]) -> list[str]:
 def _read_camera(path: Path, shape: tuple[int, int]) -> Camera | None:
     """A camera file, checked; None if it is a JSON file of something else."""
     if path.name in _FILES:
-        return _camera(_FILES[path.name](path), path, shape)
+        K, distortion = _FILES[path.name](path)
+        return _camera(K, path, shape)._replace(distortion=distortion)
     return _read_json(path, shape)
 
 
@@ -161,7 +170,7 @@ def default_camera(default: DefaultCamera, folder: Path, shape: tuple[int, int])
             f"not of {size(shape)}; expected the 3x3 camera matrix: write it to cam_K.txt there."
         )
     intrinsics = np.diag([shape[1] / 640, shape[0] / 480, 1]) @ _from_opencv(*default.numbers)
-    return Camera(intrinsics, default.source)
+    return Camera(intrinsics, default.source, distortion=default.distortion)
 
 
 def guessed(camera: Camera) -> Finding:
@@ -175,6 +184,21 @@ def guessed(camera: Camera) -> Finding:
     )
 
 
+def distorted(numbers: Iterable[float], source: object) -> tuple[Finding, ...]:
+    """The remark on the numbers of a lens distortion, if they bend the images visibly."""
+    numbers = tuple(numbers)
+    if all(abs(one) < _BENT for one in numbers):
+        return ()
+    return (
+        Finding(
+            f"{source} has the lens distortion {', '.join(f'{one:g}' for one in numbers)}, which "
+            "is ignored",
+            "Undistort depth and colour images first: otherwise surfaces are bent towards the rim "
+            "of the images.",
+        ),
+    )
+
+
 def intrinsic_numbers(K: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a camera matrix."""
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
@@ -184,29 +208,32 @@ def _from_opencv(fx: float, fy: float, cx: float, cy: float) -> Matrix:
     return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
 
 
-def _read_ours(path: Path) -> Matrix:
-    return read_matrix(path, 3)
+def _read_ours(path: Path) -> tuple[Matrix, tuple[float, ...]]:
+    return read_matrix(path, 3), ()
 
 
-def _read_opencv(path: Path) -> Matrix:
+def _read_opencv(path: Path) -> tuple[Matrix, tuple[float, ...]]:
     K = read_matrix(path, 3)
     K[:2, 2] += 0.5
-    return K
+    return K, ()
 
 
-def _read_numbers(path: Path) -> Matrix:
-    """The first four numbers of a file, as ETH3D's SLAM benchmark writes them."""
+def _read_numbers(path: Path) -> tuple[Matrix, tuple[float, ...]]:
+    """Four numbers, as ETH3D's SLAM benchmark writes them, and perhaps the lens distortion after
+    them; or a matrix."""
     try:
         words = [word for _, line in words_of(reading.read_text(path)) for word in line]
-        fx, fy, cx, cy = map(float, words[:4])
+        if len(words) == 9 and [*map(float, words[6:])] == [0, 0, 1]:
+            return _read_opencv(path)
+        fx, fy, cx, cy, *distortion = map(float, words)
     except (OSError, ValueError) as error:
         raise SequenceError(
             f"{path} cannot be read as a camera ({error}); expected `fx fy cx cy`: write it again."
         ) from error
-    return _from_opencv(fx, fy, cx, cy)
+    return _from_opencv(fx, fy, cx, cy), tuple(distortion)
 
 
-_FILES: dict[str, Callable[[Path], Matrix]] = {
+_FILES: dict[str, Callable[[Path], tuple[Matrix, tuple[float, ...]]]] = {
     "camera-intrinsics.txt": _read_ours,
     "cam_K.txt": _read_opencv,
     "calibration.txt": _read_numbers,

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageFile
 from recordings import (
+    OPENCV,
     WRITERS,
     H,
     K,
@@ -139,10 +140,31 @@ def test_tum_cameras_are_known_by_the_name_of_the_folder(tmp_path, folder, fx, c
     sequence = open_sequence(tmp_path / folder)
     assert source in sequence.camera
     np.testing.assert_allclose(sequence.intrinsics[0], [fx / 10, 0, cx / 10])
-    assert [len(sequence.findings), "ROS" in sequence.camera] in ([0, False], [1, True])
+    said = [finding.evidence for finding in sequence.findings]
+    assert len(said) == (source != "freiburg3") and "ROS" not in "".join(said[1:])
+    assert sequence.camera_is_guess == ("ROS" in sequence.camera)
+    lens = {"freiburg1": "distortion 0.2624, -0.9531", "freiburg2": "distortion 0.2312, -0.7849"}
+    assert all(lens.get(source, "no camera file") in one for one in said)
 
 
-@pytest.mark.parametrize("write, folder", [(write_tum, "fr1"), (write_redwood, "chair")])
+@pytest.mark.parametrize("lens", ["0.26 -0.95 0 0 1.16", "0 0 0 0 0", ""])
+def test_a_lens_distortion_after_the_camera_is_remarked(tmp_path, lens):
+    write_tum(tmp_path, SEEN)
+    (tmp_path / "calibration.txt").write_text(f"60 60\n31.5 23.5\n{lens}\n")
+    sequence = open_sequence(tmp_path)
+    np.testing.assert_allclose(sequence.intrinsics, K)
+    said = "calibration.txt has the lens distortion 0.26, -0.95, 0, 0, 1.16, which is ignored"
+    assert [one.evidence for one in sequence.findings] == [said] * ("0.26" in lens)
+    assert not sequence.camera_is_guess
+
+
+def test_a_calibration_may_be_a_matrix(tmp_path):
+    write_tum(tmp_path, SEEN)
+    np.savetxt(tmp_path / "calibration.txt", OPENCV)
+    np.testing.assert_allclose(open_sequence(tmp_path).intrinsics, K)
+
+
+@pytest.mark.parametrize("write, folder", [(write_tum, "fr3"), (write_redwood, "chair")])
 def test_a_camera_that_is_not_read_is_named_though_another_is_known(tmp_path, write, folder):
     write(tmp_path / folder, SEEN)
     for name in ("calibration.txt", "cam_K.txt"):

@@ -350,6 +350,20 @@ def test_lenses_and_missing_depth_are_remarked(tmp_path):
     assert left.startswith("1 frames have no depth") and "-0.2" in bent
 
 
+@pytest.mark.parametrize(
+    "lens",
+    [{"is_fisheye": True}, {"camera_model": "EQUIRECTANGULAR"}, {"distortion_params": [0.3]}],
+)
+@pytest.mark.parametrize("frame", [None, 2])
+def test_cameras_that_are_no_pinholes_are_remarked(tmp_path, lens, frame):
+    write_nerfstudio(tmp_path, SEEN)
+    about = json.loads((tmp_path / "transforms.json").read_text())
+    (about if frame is None else about["frames"][frame]).update(lens)
+    (tmp_path / "transforms.json").write_text(json.dumps(about))
+    (remark,) = open_sequence(tmp_path).findings
+    assert any(word in remark.evidence for word in ("fisheye", "EQUIRECTANGULAR", "0.3, which"))
+
+
 # Arrays and floats -----------------------------------------------------------------------------
 
 
@@ -372,6 +386,13 @@ def test_arrays_that_may_be_poses_are_named(tmp_path):
     np.savez(path, depth=SEEN.depth, K=OPENCV, extrinsics=SEEN.T_world_camera, gain=1)
     (remark,) = open_sequence(path).findings
     assert "scan.npz holds extrinsics, which are not read" in remark.evidence
+
+
+def test_a_lens_and_a_depth_scale_beside_arrays_are_named(tmp_path):
+    arrays = {"depth": SEEN.depth, "K": SEEN.opencv, "poses": SEEN.T_world_camera}
+    np.savez(tmp_path / "scan.npz", **arrays, dist_coeffs=np.ones(5), depth_scale=1000.0)
+    (remark,) = open_sequence(tmp_path).findings
+    assert "holds depth_scale, dist_coeffs, which are not read" in remark.evidence
 
 
 def test_arrays_that_do_not_fit_are_named(tmp_path):

@@ -1,6 +1,7 @@
 """A single `.npz` file of arrays: depth, and optionally colour, cameras, poses, masks and times."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ _NAMES = {
 }
 
 _POSES = re.compile("pose|extrinsic|traj|w2c|c2w|cam", re.IGNORECASE)
+_OTHERS = re.compile(r"distort|dist_?coef|^dist$|depth_?scale", re.IGNORECASE)
 
 
 def fits(contents: Contents) -> bool:
@@ -74,22 +76,27 @@ def list_frames(contents: Contents) -> Listed:
         read_pose=None if poses is None else lambda i: known(poses[i], f"{path}: pose {i}"),
         times=times if times is not None and _rises(times) else None,
         calibration=None if K is None else _calibration(K, path),
-        findings=_without_poses(path) if poses is None else (),
+        findings=tuple(_unread(path, has_poses=poses is not None)),
     )
 
 
-def _without_poses(path: Path) -> tuple[Finding, ...]:
-    """A remark on arrays that may be poses, in a file without poses."""
-    others = sorted(filter(_POSES.search, reading.array_names(path)))
-    if not others:
-        return ()
-    return (
-        Finding(
+def _unread(path: Path, *, has_poses: bool) -> Iterator[Finding]:
+    """Remarks on arrays that may be poses, in a file without poses, and on a lens distortion or a
+    depth scale."""
+    names = sorted(reading.array_names(path))
+    others = list(filter(_POSES.search, names))
+    if others and not has_poses:
+        yield Finding(
             f"{path.name} holds {', '.join(others[:4])}, which are not read",
             "If they are poses, save them camera to world as poses [n 4 4]; otherwise the camera "
             "is tracked.",
-        ),
-    )
+        )
+    if others := list(filter(_OTHERS.search, names)):
+        yield Finding(
+            f"{path.name} holds {', '.join(others[:4])}, which are not read",
+            "Undistort depth and colour images first, and give the depth units per metre as "
+            "--depth-scale.",
+        )
 
 
 def _rises(times: np.ndarray) -> bool:

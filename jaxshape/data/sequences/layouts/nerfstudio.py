@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxshape.data.sequences.cameras import Calibration, matrices_of
+from jaxshape.data.sequences.cameras import Calibration, distorted, matrices_of
 from jaxshape.data.sequences.documents import below, matrix_of, read_json_object, shape_of
 from jaxshape.data.sequences.frames import (
     Finding,
@@ -29,6 +29,7 @@ from jaxshape.data.sequences.poses import from_opengl, known
 
 _SOURCE = "transforms.json"
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_NO_PINHOLE = ("fisheye", "equirectangular", "ortho", "vr180", "omni")
 _UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
 _CAMERA = ("h", "w", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
 
@@ -72,7 +73,7 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=_depth_scale(about, files, source),
         read_pose=read,
         calibration=_calibration(about, frames, files, source),
-        findings=(*_left_out(len(depth) - len(kept)), *_distorted(about, frames)),
+        findings=(*_left_out(len(depth) - len(kept)), *_distorted(about, frames, source)),
     )
 
 
@@ -177,16 +178,18 @@ def _left_out(count: int) -> tuple[Finding, ...]:
     return (Finding(f"{count} frames have no depth image", "They are left out."),)
 
 
-def _distorted(about: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Finding, ...]:
-    entry = about | frames[0]
-    lens = {name: entry[name] for name in _LENS if isinstance(entry.get(name), int | float)}
-    if max(map(abs, lens.values()), default=0.0) < 0.01 and "FISHEYE" not in str(
-        entry.get("camera_model")
-    ):
-        return ()
-    return (
-        Finding(
-            f"the images have lens distortion ({lens}), which is ignored",
-            "Undistort colour and depth images first, if the reconstructed surfaces are bent.",
-        ),
-    )
+def _distorted(
+    about: dict[str, Any], frames: list[dict[str, Any]], source: Path
+) -> tuple[Finding, ...]:
+    """The remark on the first lens, of the file or of a frame, that is not a pinhole's."""
+    for entry in (about, *frames):
+        model = "fisheye" if entry.get("is_fisheye") else str(entry.get("camera_model", ""))
+        if any(word in model.lower() for word in _NO_PINHOLE):
+            advice = "Undistort depth and colour images to a pinhole camera first."
+            return (Finding(f"{source.name} is of a camera of model {model}", advice),)
+        given = entry.get("distortion_params")
+        numbers = [entry.get(name) for name in _LENS] + (given if isinstance(given, list) else [])
+        lens = [float(one) for one in numbers if isinstance(one, int | float)]
+        if remark := distorted(lens, source.name):
+            return remark
+    return ()

@@ -23,11 +23,12 @@ from jaxshape.data.sequences.poses import READABLE_GAP, known, poses_at
 from jaxshape.data.sequences.trajectories import read_trajectory
 
 _CALIBRATED = {
-    "1": (517.3, 516.5, 318.6, 255.3),
-    "2": (520.9, 521.0, 325.1, 249.7),
-    "3": (535.4, 539.2, 320.1, 247.6),
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
-"""fx, fy, cx, cy of the benchmark's colour cameras, to which depth is registered."""
+"""fx, fy, cx, cy of the benchmark's colour cameras, to which depth is registered, and the
+distortion of their lenses."""
 
 
 def fits(contents: Contents) -> bool:
@@ -128,5 +129,6 @@ def _camera_of(folder: Path) -> DefaultCamera:
     which = re.search(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)", names, re.IGNORECASE)
     if which:
         source = f"TUM's calibration of freiburg{which[1]}"
-        return DefaultCamera(_CALIBRATED[which[1]], source, sure=True)
+        numbers, distortion = _CALIBRATED[which[1]]
+        return DefaultCamera(numbers, source, sure=True, distortion=distortion)
     return DefaultCamera(PRIMESENSE, "the default of ROS for a Kinect", sure=False)
