@@ -286,6 +286,11 @@ def _checked(K: Matrix, path: Path | str, shape: tuple[int, int]) -> Matrix:
             f"{path} has focal lengths {fx:g}, {fy:g} and last row {K[2].tolist()}; "
             "expected positive focal lengths in pixels and 0 0 1: write fx 0 cx / 0 fy cy / 0 0 1."
         )
+    if max(abs(K[0, 1]), abs(K[1, 0])) > 0.01 * min(fx, fy):
+        raise SequenceError(
+            f"{path} has {K[0, 1]:g} and {K[1, 0]:g} beside its focal lengths {fx:g}, {fy:g}; "
+            "expected 0, as pixels have no skew: write fx 0 cx / 0 fy cy / 0 0 1."
+        )
     if not 0.05 < min(fx, fy) / max(h, w) <= max(fx, fy) / max(h, w) < 100:
         raise SequenceError(
             f"{path} has focal lengths {fx:g}, {fy:g}, with which images of {size(shape)} pixels "

@@ -239,6 +239,7 @@ def test_a_rigid_motion_passes_and_nan_does_not():
         (K * [[0], [1], [1]], "focal lengths 0, 10"),
         (K * [[2], [2], [1]], "principal point at 8, 6"),
         (K * [[1], [1], [2]], r"last row [0.0, 0.0, 2.0]"),
+        (K + [[0, 1, 0], [0, 0, 0], [0, 0, 0]], "has 1 and 0 beside its focal lengths"),
         (K[:2], "is not a matrix"),
     ],
 )
