@@ -17,10 +17,11 @@ from jaxshape.data.sequences.poses import NEAR
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".npy", ".exr")
 COLOR_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".ppm")
 
-DEPTH_FOLDERS = ("aligned_depth_to_color", "depth", "depths", "Depth")
+DEPTH_FOLDERS = ("aligned_depth_to_color", "depth", "depths")
 """The first one counts: beside aligned images, those in `depth` are not registered to colour."""
 
-COLOR_FOLDERS = ("color", "image", "rgb", "colors", "images", "Color", "RGB")
+COLOR_FOLDERS = ("color", "image", "rgb", "colors", "images")
+MASK_FOLDERS = ("masks", "mask")
 
 
 class Contents(NamedTuple):
@@ -92,32 +93,36 @@ def files_in(
 
     Of files that differ in their suffix alone, that of the last of `suffixes` counts.
     """
-    for name in names:
-        if name in contents.folders:
-            folder = contents.folder / name
-            inside = list_folder(folder)  # reading them reports faults of other entries
-            found = (os.path.splitext(file) for file in inside.files | inside.others)
-            chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
-            natural = natural_order([stem for stem, _ in chosen])
-            chosen.sort(key=lambda one: (natural(one[0]), suffixes.index(one[1].lower())))
-            return {stem: folder / (stem + end) for stem, end in chosen}
-    return {}
+    folder = folder_of(contents, names)
+    if folder is None:
+        return {}
+    inside = list_folder(folder)  # reading them reports faults of other entries
+    found = (os.path.splitext(file) for file in inside.files | inside.others)
+    chosen = [(stem, end) for stem, end in found if end.lower() in suffixes]
+    natural = natural_order([stem for stem, _ in chosen])
+    chosen.sort(key=lambda one: (natural(one[0]), suffixes.index(one[1].lower())))
+    return {stem: folder / (stem + end) for stem, end in chosen}
+
+
+def folder_of(contents: Contents, names: Iterable[str]) -> Path | None:
+    """The first of `names` that is a sub-folder, in capital or small letters; None without one."""
+    there = {name.lower(): name for name in sorted(contents.folders)}  # small letters come last
+    return next((contents.folder / there[name] for name in names if name in there), None)
 
 
 def depth_images(contents: Contents) -> dict[str, Path]:
     """The images of the folder of depth images; `SequenceError` if there are none."""
     images = files_in(contents, DEPTH_FOLDERS, DEPTH_SUFFIXES)
     if not images:
-        name = next((one for one in DEPTH_FOLDERS if one in contents.folders), "depth")
+        folder = folder_of(contents, DEPTH_FOLDERS) or contents.folder / "depth"
         raise SequenceError(
-            f"{contents.folder / name} holds no depth image; expected 16-bit PNG files: "
-            "copy them there."
+            f"{folder} holds no depth image; expected 16-bit PNG files: copy them there."
         )
     return images
 
 
 def has_depth_folder(contents: Contents) -> bool:
-    return not contents.folders.isdisjoint(DEPTH_FOLDERS)
+    return folder_of(contents, DEPTH_FOLDERS) is not None
 
 
 def color_images(contents: Contents) -> dict[str, Path]:
@@ -125,7 +130,7 @@ def color_images(contents: Contents) -> dict[str, Path]:
 
 
 def mask_images(contents: Contents) -> dict[str, Path]:
-    return files_in(contents, ("masks", "mask"), COLOR_SUFFIXES)
+    return files_in(contents, MASK_FOLDERS, COLOR_SUFFIXES)
 
 
 # Files that belong together

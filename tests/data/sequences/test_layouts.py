@@ -327,6 +327,17 @@ def test_odd_names_and_orders(tmp_path):
     assert colors == {"été 2": True, "9": False, "Kopie von 10": False, "left 1": True}
 
 
+def test_folders_may_be_in_capitals(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    before = open_sequence(tmp_path)[2]
+    for name in ("DEPTH", "Color", "Mask"):
+        (tmp_path / name.lower()).rename(tmp_path / name)
+    after = open_sequence(tmp_path)[2]
+    np.testing.assert_array_equal(after.depth, before.depth)
+    np.testing.assert_array_equal(after.color, before.color)
+    np.testing.assert_array_equal(after.mask, before.mask)
+
+
 def test_frames_are_counted_not_spelt(tmp_path):
     for i in (1, 2, 10, 100):
         save(tmp_path / f"depth/{i}.png", raw(SEEN.depth[0], 1000))

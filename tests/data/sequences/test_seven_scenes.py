@@ -64,6 +64,19 @@ def test_colour_and_mask_are_optional_and_colour_may_be_jpeg(folder):
     Image.new("RGB", (W, H), (255, 0, 0)).save(folder / "frame-000000.color.jpg")
     color = open_sequence(folder)[0].color
     assert color is not None and color[..., 0].min() > 250 and color[..., 1:].max() < 5
+    (folder / "frame-000000.color.jpg").rename(folder / "frame-000000.color.jpeg")
+    np.testing.assert_array_equal(open_sequence(folder)[0].color, color)
+
+
+def test_names_may_be_in_capitals(folder):
+    write_frame(folder, "000001", color=np.full((H, W, 3), 9, np.uint8))
+    first, second = open_sequence(folder)
+    for path in folder.glob("frame-*"):
+        path.rename(folder / path.name.upper())
+    again = open_sequence(folder)
+    assert len(again) == 2 and again.names == (first.name, second.name)
+    np.testing.assert_array_equal(again[1].color, second.color)
+    np.testing.assert_array_equal(again[1].depth, second.depth)
 
 
 @pytest.mark.parametrize("scale", [1000.0, 5000.0])

@@ -7,7 +7,7 @@ from jaxshape.data.sequences.frames import Finding, FrameFiles
 from jaxshape.data.sequences.listing import Contents, Listed
 from jaxshape.data.sequences.poses import read_pose
 
-_NAME = re.compile(r"frame-(\d+)\.(depth\.png|pose\.txt)")
+_NAME = re.compile(r"frame-(\d+)\.(depth\.png|pose\.txt)", re.IGNORECASE)
 
 
 def fits(contents: Contents) -> bool:
@@ -16,23 +16,23 @@ def fits(contents: Contents) -> bool:
 
 def list_frames(contents: Contents) -> Listed:
     """`frame-N.depth.png` with `.pose.txt`, `.color.png` or `.jpg`, and `.mask.png` of the same
-    name."""
-    folder, present = contents.folder, contents.files
+    name, in capital or small letters."""
+    present = {name.lower(): contents.folder / name for name in sorted(contents.files)}
     numbers: dict[str, set[str]] = {"depth.png": set(), "pose.txt": set()}
     for match in filter(None, map(_NAME.fullmatch, present)):
         numbers[match[2]].add(match[1])
     names = [f"frame-{number}" for number in sorted(numbers["depth.png"], key=int)]
 
     def first_of(*files: str) -> Path | None:
-        return next((folder / file for file in files if file in present), None)
+        return next((present[file] for file in files if file in present), None)
 
     poses = [first_of(f"{name}.pose.txt") for name in names]
     return Listed(
         files=tuple(
             FrameFiles(
                 name=name,
-                depth=folder / f"{name}.depth.png",
-                color=first_of(f"{name}.color.png", f"{name}.color.jpg"),
+                depth=present[f"{name}.depth.png"],
+                color=first_of(*(f"{name}.color{end}" for end in (".png", ".jpg", ".jpeg"))),
                 mask=first_of(f"{name}.mask.png"),
             )
             for name in names
