@@ -5,7 +5,17 @@ import re
 from collections.abc import Iterator
 
 from jaxshape.data.sequences.frames import Finding
-from jaxshape.data.sequences.listing import Contents, Listed, color_images, mask_images
+from jaxshape.data.sequences.listing import (
+    COLOR_FOLDERS,
+    COLOR_SUFFIXES,
+    MASK_FOLDERS,
+    Contents,
+    Listed,
+    color_images,
+    folder_of,
+    list_folder,
+    mask_images,
+)
 
 _POSES = re.compile(
     r"pose|traj|odom|groundtruth|ground_truth|transforms.*json|scene_gt|extrinsic|cameras?\.txt"
@@ -15,7 +25,10 @@ _POSES = re.compile(
 _CAMERA = re.compile(
     r"intrinsic|calib|scene_camera|camera|cam_k|metadata|info\.txt|transforms.*json", re.IGNORECASE
 )
-_TEXT = (".txt", ".json", ".csv", ".log", ".yaml", ".yml", ".tum", ".bin", ".freiburg", ".xml")
+_KINDS = (
+    ".txt", ".json", ".csv", ".log", ".yaml", ".yml", ".tum", ".bin", ".freiburg", ".xml",
+    ".npy", ".npz", ".pkl", ".mat", ".h5",
+)  # fmt: skip
 _OURS = ("keyframes.json", "result.json")
 
 
@@ -69,16 +82,32 @@ def unmatched(contents: Contents, listed: Listed) -> Iterator[Finding]:
             "has a list. If one kind is counted from 0 and the other from 1, all colours are a "
             "frame late.",
         )
-    if not any(one.mask for one in files) and (masks := len(mask_images(contents))):
+    elif listed.color_delays is None and alone == len(files):
+        yield from _of_other_kinds(contents, COLOR_FOLDERS)
+    if not any(one.mask for one in files):
+        if masks := len(mask_images(contents)):
+            yield Finding(
+                f"none of {masks} masks is read",
+                "Give each mask the name of its depth image, and list it if the recording has a "
+                "list.",
+            )
+        else:
+            yield from _of_other_kinds(contents, MASK_FOLDERS)
+
+
+def _of_other_kinds(contents: Contents, names: tuple[str, ...]) -> Iterator[Finding]:
+    """A remark on a folder of images in which no file is of a kind that is read."""
+    folder = folder_of(contents, names)
+    if folder is not None and (files := sorted(list_folder(folder).files)):
         yield Finding(
-            f"none of {masks} masks is read",
-            "Give each mask the name of its depth image, and list it if the recording has a list.",
+            f"none of {len(files)} files in {folder.name}/ is read, {files[0]} among them",
+            f"Save them as {', '.join(COLOR_SUFFIXES)}.",
         )
 
 
 def _like(pattern: re.Pattern[str], contents: Contents) -> str:
     """Names that match, in words; at most four."""
-    files = (name for name in contents.files if name.lower().endswith(_TEXT) and name not in _OURS)
+    files = (name for name in contents.files if name.lower().endswith(_KINDS) and name not in _OURS)
     folders = (f"{name}/" for name in contents.folders)
     found = sorted(filter(pattern.search, (*files, *folders)))
     return ", ".join(found[:4]) + (", ..." if len(found) > 4 else "")

@@ -225,6 +225,15 @@ def test_masks_of_other_names_are_named(tmp_path):
 # Poses -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("folder, end", [("color", ".webp"), ("color", ".bmp"), ("mask", ".npy")])
+def test_images_of_a_kind_that_is_not_read_are_named(tmp_path, folder, end):
+    write_open3d(tmp_path, SEEN)
+    for path in (tmp_path / folder).iterdir():
+        path.rename(path.with_suffix(end))
+    (remark,) = open_sequence(tmp_path).findings
+    assert f"none of 6 files in {folder}/ is read, {folder}_0{end} among them" == remark.evidence
+
+
 def test_frames_without_a_pose(tmp_path):
     write_open3d(tmp_path / "a", SEEN)
     lines = (tmp_path / "a/trajectory.log").read_text().splitlines()

@@ -91,7 +91,7 @@ def test_time_bases_without_overlap_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["pose.txt", "CameraTrajectory.txt", "scene_gt.json", "trajectory.txt"]
+    "name", ["pose.txt", "CameraTrajectory.txt", "scene_gt.json", "trajectory.txt", "poses.npy"]
 )
 def test_poses_that_are_not_read_are_named(tmp_path, name):
     write_open3d(tmp_path, SEEN)
@@ -102,7 +102,9 @@ def test_poses_that_are_not_read_are_named(tmp_path, name):
     assert f"no poses are read, though {name} may hold them" in warning.evidence
 
 
-@pytest.mark.parametrize("name", ["camera_matrix.csv", "intrinsic/calibration.txt", "metadata"])
+@pytest.mark.parametrize(
+    "name", ["camera_matrix.csv", "K_intrinsics.npy", "intrinsic/calibration.txt", "metadata"]
+)
 def test_cameras_that_are_not_read_are_named(tmp_path, name):
     write_open3d(tmp_path, SEEN)
     (tmp_path / "camera_primesense.json").unlink()
