@@ -36,8 +36,8 @@ from jaxshape.data.sequences.frames import Frame as Frame
 from jaxshape.data.sequences.frames import FrameFiles as FrameFiles
 from jaxshape.data.sequences.frames import Sequence as Sequence
 from jaxshape.data.sequences.frames import SequenceError as SequenceError
+from jaxshape.data.sequences.frames import first_shape, read_shape, same_aspect, size
 from jaxshape.data.sequences.frames import read_depth as read_depth
-from jaxshape.data.sequences.frames import read_shape, same_aspect, size
 from jaxshape.data.sequences.layouts import (
     arrays,
     bop,
@@ -230,10 +230,9 @@ def _may_fit(folder: Path) -> bool:
 
 def _shape_of(listed: Listed) -> tuple[int, int]:
     """Height and width of the first depth image whose header can be read."""
-    for files in listed.files[:20]:
-        with suppress(SequenceError):
-            return read_shape(files.depth, limits.DEPTH_PIXELS)
-    return read_shape(listed.files[0].depth, limits.DEPTH_PIXELS)  # raises if the image is damaged
+    depth = [files.depth for files in listed.files]
+    # If none can be read, the first one says why.
+    return first_shape(depth, limits.DEPTH_PIXELS) or read_shape(depth[0], limits.DEPTH_PIXELS)
 
 
 def _cameras(
@@ -269,11 +268,7 @@ def _without_other_colors(
     listed: Listed, shape: tuple[int, int]
 ) -> tuple[tuple[FrameFiles, ...], tuple[Finding, ...]]:
     """Leave out all colour images, if the first has another aspect than the depth images."""
-    first = next((files.color for files in listed.files if files.color), None)
-    try:
-        seen = read_shape(first) if first else shape
-    except SequenceError:  # one damaged image tells nothing about the others
-        seen = shape
+    seen = first_shape(files.color for files in listed.files if files.color) or shape
     if same_aspect(seen, shape):
         return listed.files, ()
     finding = Finding(

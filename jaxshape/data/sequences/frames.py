@@ -369,6 +369,16 @@ def read_shape(path: Picture, most: int = limits.COLOR_PIXELS) -> tuple[int, int
         return image.height, image.width
 
 
+def first_shape(
+    pictures: Iterable[Picture], most: int = limits.COLOR_PIXELS
+) -> tuple[int, int] | None:
+    """Height and width of the first of up to 20 images whose header can be read, if any."""
+    for picture in islice(pictures, 20):
+        with suppress(SequenceError):
+            return read_shape(picture, most)
+    return None
+
+
 def size(shape: tuple[int, int]) -> str:
     return f"{shape[1]} x {shape[0]}"
 

@@ -249,6 +249,18 @@ def test_depth_is_in_the_unit_of_the_scene(tmp_path):
 # Stray Scanner and Record3D --------------------------------------------------------------------
 
 
+def test_tables_of_rows_of_other_lengths_are_refused(tmp_path):
+    write_stray_scanner(tmp_path, SEEN)
+    path = tmp_path / "odometry.csv"
+    first, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([first, *rows[:2], rows[2] + ", 7", *rows[3:]]))
+    assert "a row has more cells than the first line" in fault_of(tmp_path)
+    path.write_text("\n".join([first + ", more" * 100, *(row + ", 7" * 100 for row in rows)]))
+    np.testing.assert_allclose(
+        open_sequence(tmp_path)[2].T_world_camera, SEEN.T_world_camera[2], atol=1e-6
+    )
+
+
 def test_a_film_is_named_and_the_camera_is_of_its_size(tmp_path):
     write_stray_scanner(tmp_path, SEEN, own_cameras=False, unpacked=False)
     sequence = open_sequence(tmp_path)
@@ -513,6 +525,33 @@ def test_the_size_of_raw_depth_without_colour_is_one_of_the_camera(tmp_path):
     np.savetxt(tmp_path / "cam_K.txt", [[300, 0, 212], [0, 300, 120], [0, 0, 1]])
     (frame,) = open_sequence(tmp_path)
     np.testing.assert_allclose(frame.depth, deep / 1000, rtol=1e-6)
+
+
+def test_raw_depth_of_another_length_costs_its_frame_alone(tmp_path):
+    write_realsense(tmp_path, SEEN)
+    first, second, *_ = sorted(tmp_path.glob("*_Depth_*.raw"))
+    first.write_bytes(b"")
+    second.write_bytes(2 * second.read_bytes())
+    sequence = open_sequence(tmp_path)
+    for index in (0, 1):
+        with pytest.raises(SequenceError, match="cannot be read as an image"):
+            sequence.read_depth(index)
+    np.testing.assert_allclose(sequence.read_depth(2), SEEN.depth[2], atol=1e-6)
+
+
+@pytest.mark.parametrize("name, folder", [("stray-scanner", "rgb"), ("nerfstudio", "images")])
+def test_a_first_colour_that_is_damaged_costs_its_frame_alone(tmp_path, name, folder):
+    WRITERS[name](tmp_path, SEEN)
+    if name == "nerfstudio":
+        about = json.loads((tmp_path / "transforms.json").read_text())
+        edit(tmp_path, frames=[one | {"w": None, "h": None} for one in about["frames"]])
+        for path in (tmp_path / folder).iterdir():  # the camera is that of larger images
+            save(path, np.zeros((2 * H, 2 * W, 3), np.uint8))
+    before = open_sequence(tmp_path)
+    sorted((tmp_path / folder).iterdir())[0].write_bytes(b"")
+    after = open_sequence(tmp_path)
+    np.testing.assert_array_equal(after[1].intrinsics, before[1].intrinsics)
+    np.testing.assert_array_equal(after[1].color, before[1].color)
 
 
 def test_raw_depth_that_cannot_be_read_ends_in_one_sentence(tmp_path):

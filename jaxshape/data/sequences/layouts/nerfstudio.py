@@ -13,6 +13,7 @@ from jaxshape.data.sequences.frames import (
     Finding,
     FrameFiles,
     SequenceError,
+    first_shape,
     read_shape,
     usual_depth_scale,
 )
@@ -146,14 +147,16 @@ def _calibration(
 
 
 def _shape(entries: list[dict[str, Any]], files: list[FrameFiles], source: Path) -> tuple[int, int]:
-    given = [(one["h"], one["w"]) for one in entries]
-    shapes = {None if None in sides else shape_of(*sides, source) for sides in given}
+    sides = [(one["h"], one["w"]) for one in entries]
+    shapes = {None if None in pair else shape_of(*pair, source) for pair in sides}
     if len(shapes) > 1:
         raise SequenceError(
             f"{source} has images of {len(shapes)} sizes; expected one size: scale the images and "
             "their cameras."
         )
-    return shapes.pop() or read_shape(files[0].color or files[0].depth)
+    if (given := shapes.pop()) is not None:
+        return given
+    return first_shape(one.color for one in files if one.color) or read_shape(files[0].depth)
 
 
 def _numbers(entry: dict[str, Any], shape: tuple[int, int], source: Path) -> list[float]:

@@ -4,13 +4,11 @@ import re
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from jaxshape import limits
 from jaxshape.data.sequences.errors import SequenceError
-from jaxshape.data.sequences.frames import FrameFiles
+from jaxshape.data.sequences.frames import FrameFiles, first_shape
 from jaxshape.data.sequences.listing import Contents, Listed, with_colors_by_time
-from jaxshape.data.sequences.rasters import Stored, open_picture
+from jaxshape.data.sequences.rasters import Stored
 
 _SIZES = (
     (1280, 720), (1024, 768), (848, 480), (640, 480), (640, 360), (480, 270), (424, 240),
@@ -47,7 +45,7 @@ def list_frames(contents: Contents) -> Listed:
             f"{contents.folder} {has}; unpack the .bag with rs-convert -r, which writes the depth "
             "itself."
         )
-    shape = _shape(depth[0][1], color)
+    shape = _shape([path for _, path in depth], [path for _, path in color])
     times = np.array([time for time, _ in depth]) / 1000
     offered = np.array([time for time, _ in color]) / 1000
     images, delays = with_colors_by_time(times, offered, [path for _, path in color])
@@ -68,28 +66,26 @@ def _timed(contents: Contents, pattern: re.Pattern[str]) -> _Timed:
     return sorted((float(match[1]), contents.folder / name) for match, name in found if match)
 
 
-def _shape(path: Path, color: _Timed) -> tuple[int, int]:
-    """Height and width of a raw depth image."""
-    pixels = path.stat().st_size / 2
-    sizes = list(_SIZES)
-    if color:
-        try:
-            with open_picture(color[0][1], limits.COLOR_PIXELS) as image:
-                sizes.insert(0, (image.width, image.height))
-        except (OSError, ValueError, Image.DecompressionBombError):
-            pass  # reading the frame reports its fault
-    for width, height in sizes:
-        if width * height == pixels:
-            return height, width
+def _shape(depth: list[Path], color: list[Path]) -> tuple[int, int]:
+    """Height and width of raw depth images, from the first whose size fits."""
+    shapes = [(height, width) for width, height in _SIZES]
+    if (seen := first_shape(color)) is not None:
+        shapes.insert(0, seen)
+    sizes = [path.stat().st_size for path in depth[:20]]
+    for size in sizes:
+        for height, width in shapes:
+            if 2 * width * height == size:
+                return height, width
     raise SequenceError(
-        f"{path} holds {path.stat().st_size:,} bytes, which no depth image of a RealSense camera"
-        " has; save depth as 16-bit PNG files in a folder depth/."
+        f"{depth[0]} holds {sizes[0]:,} bytes, which no depth image of a RealSense camera has; "
+        "save depth as 16-bit PNG files in a folder depth/."
     )
 
 
 def _depth_image(path: Path, shape: tuple[int, int]) -> Path | Stored:
     """The image in a file; for a file of another length, the file itself, so that reading fails."""
     try:
-        return Stored(str(path), np.memmap(path, "<u2", "r", shape=shape))
+        pixels = np.memmap(path, "<u2", "r")
+        return Stored(str(path), pixels.reshape(shape))
     except (OSError, ValueError):
         return path

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
 from jaxshape.data.sequences.documents import read_document, rows_of
-from jaxshape.data.sequences.frames import Finding, SequenceError, read_shape
+from jaxshape.data.sequences.frames import Finding, SequenceError, first_shape
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
@@ -84,8 +84,12 @@ def _read_columns(path: Path) -> dict[str, Float[np.ndarray, " n"]]:
             "export the recording again."
         )
     try:
+        if any(len(row) > len(lines[0]) for row in lines):
+            raise ValueError("a row has more cells than the first line")
         rows = [
-            [float(cell) if cell.strip() else np.nan for cell in row] for row in lines[1:] if row
+            [float(cell) if cell.strip() else np.nan for cell in row[: len(names)]]
+            for row in lines[1:]
+            if row
         ]
         table = np.array([row + [np.nan] * (len(names) - len(row)) for row in rows])
         table = table.reshape(-1, len(names))
@@ -104,8 +108,7 @@ def _calibration(
     contents: Contents, columns: dict[str, np.ndarray], rows: list[int], color: list[Path | None]
 ) -> Calibration | None:
     """The camera of each frame, or else the common camera; both for images of the film's size."""
-    images = [path for path in color if path]
-    shape = read_shape(images[0]) if images else _FILM
+    shape = first_shape(path for path in color if path) or _FILM
     own = [columns[name][rows] for name in _OWN_CAMERA if name in columns]
     if len(own) == 4 and min(rows) >= 0 and np.isfinite(own).all():
         return Calibration(matrices_of(*own), shape, "odometry.csv, of each frame its own")
