@@ -150,18 +150,19 @@ def partners(wanted: Iterable[str], offered: Mapping[str, Path]) -> list[Path | 
     return [offered.get(name) or by_number.get(numbers_in(name)) for name in wanted]
 
 
-def miscounted_poses(found: list[Path | None], offered: int) -> tuple[Finding, ...]:
+def miscounted_poses(found: Iterable[bool], offered: int) -> tuple[Finding, ...]:
     """A remark if depth images have no pose although there are enough of them.
 
     Args:
-        found: File of the pose of each depth image; None for none.
-        offered: Number of files of poses.
+        found: Whether there is a pose of the number of each depth image.
+        offered: Number of poses.
     """
-    if None not in found or offered < len(found):
+    found = list(found)
+    if all(found) or offered < len(found):
         return ()
     return (
         Finding(
-            f"{found.count(None)} of {len(found)} depth images have no pose of their number, "
+            f"{found.count(False)} of {len(found)} depth images have no pose of their number, "
             f"although there are {offered} poses",
             "Give poses the numbers of their images: if one kind is counted from 0 and the other "
             "from 1, all poses are a frame late.",

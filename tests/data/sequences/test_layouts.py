@@ -201,6 +201,14 @@ def test_tum_without_colours_or_poses(tmp_path):
     assert not sequence.has_poses and sequence[0].color is None and sequence.color_delays is None
 
 
+def test_depth_images_that_a_list_leaves_out_are_counted(tmp_path):
+    write_tum(tmp_path, SEEN)
+    lines = (tmp_path / "depth.txt").read_text().splitlines()
+    (tmp_path / "depth.txt").write_text("\n".join(lines[:-4]))
+    (remark,) = open_sequence(tmp_path).findings
+    assert remark.evidence == "4 of 6 images in depth/ are not listed in depth.txt"
+
+
 def test_tum_colours_without_a_list_are_found_by_name_or_missed(tmp_path):
     write_tum(tmp_path, SEEN, color_delay=0)
     (tmp_path / "rgb.txt").unlink()

@@ -1,6 +1,7 @@
 """What phones, datasets and renderers write is read as it was seen, with their own conventions."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -159,6 +160,37 @@ def test_poses_that_are_counted_from_another_number_are_named(tmp_path, layout):
         path.rename(path.with_stem(str(int(path.stem) + 1)))
     remark = open_sequence(tmp_path, layout=layout).findings[0]
     assert "1 of 5 depth images have no pose of their number, although" in remark.evidence
+
+
+@pytest.mark.parametrize("name", ["record3d", "wildrgb-d", "stray-scanner", "icl-nuim"])
+def test_poses_of_one_file_that_are_counted_from_another_number_are_named(tmp_path, name):
+    WRITERS[name](tmp_path, SEEN)
+    before = open_sequence(tmp_path).findings
+    for folder in {"depth", "rgb", "masks", "confidence"} & {
+        one.name for one in tmp_path.iterdir()
+    }:
+        paths = sorted((tmp_path / folder).iterdir(), reverse=True)
+        for path in paths:
+            path.rename(path.with_stem(str(int(path.stem) + 1).zfill(len(path.stem))))
+    (remark,) = set(open_sequence(tmp_path).findings) - set(before)
+    assert "1 of 5 depth images have no pose of their number, although" in remark.evidence
+
+
+@pytest.mark.parametrize(
+    "start, fault",
+    [("nan 0 0 0 0 0 0 1", None), ("inf 0 0 0 0 0 0 1", None), ("0 0 0 0 5 5 5 5", "length 1")],
+)
+def test_poses_of_icl_nuim_without_a_number_or_a_rotation(tmp_path, start, fault):
+    WRITERS["icl-nuim"](tmp_path, SEEN)
+    (path,) = tmp_path.glob("*.gt.freiburg")
+    path.write_text("\n".join([start, *path.read_text().splitlines()[1:]]))
+    sequence = open_sequence(tmp_path)
+    np.testing.assert_allclose(sequence[1].T_world_camera, SEEN.T_world_camera[1], atol=1e-6)
+    if fault is None:
+        assert sequence[0].T_world_camera is None
+    else:
+        with pytest.raises(SequenceError, match=fault):
+            sequence[0]
 
 
 # ScanNet, WildRGB-D, Replica -------------------------------------------------------------------
@@ -360,6 +392,13 @@ def test_lenses_and_missing_depth_are_remarked(tmp_path):
     assert len(sequence) == 4
     left, bent = (finding.evidence for finding in sequence.findings)
     assert left.startswith("1 frames have no depth") and "-0.2" in bent
+
+
+def test_colours_that_are_named_and_missing_are_counted(tmp_path):
+    write_nerfstudio(tmp_path, SEEN)
+    shutil.rmtree(tmp_path / "images")
+    (remark,) = open_sequence(tmp_path).findings
+    assert "5 colour images that transforms.json names do not exist" in remark.evidence
 
 
 @pytest.mark.parametrize(

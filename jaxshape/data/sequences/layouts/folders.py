@@ -130,7 +130,8 @@ def _pose_files(
     for folder, is_object_to_camera in _POSE_FOLDERS.items():
         if offered := files_in(contents, (folder,), (".txt",)):
             found = partners(names, offered)
-            return _reader(found, is_object_to_camera), miscounted_poses(found, len(offered))
+            doubts = miscounted_poses(map(bool, found), len(offered))
+            return _reader(found, is_object_to_camera), doubts
     return None, ()
 
 

@@ -13,6 +13,7 @@ from jaxshape.data.sequences.listing import (
     frame_files,
     has_depth_folder,
     last_number,
+    miscounted_poses,
 )
 from jaxshape.data.sequences.poses import known
 
@@ -33,17 +34,17 @@ def list_frames(contents: Contents) -> Listed:
     """`depth/N.png` in units of 1/5000 m, `rgb/N.png`, and lines `N x y z qx qy qz qw`."""
     depth = depth_images(contents)
     source = contents.folder / str(_poses(contents))
-    rows = {int(row[0]): np.array(row[1:]) for row in rows_of(source, (8,))}
+    rows = {row[0]: np.array(row[1:]) for row in rows_of(source, (8,))}
     numbers = list(map(last_number, depth))
 
     def read(index: int):
         row = rows.get(numbers[index])
         if row is None:
             return None
-        if not np.linalg.norm(row[3:]) > 0:
+        if not abs(np.linalg.norm(row[3:]) - 1) <= 1e-2:
             raise SequenceError(
                 f"Pose {numbers[index]} of {source} has the quaternion {row[3:].tolist()}; expected"
-                " a rotation: copy the file again."
+                " one of length 1: copy the file again."
             )
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = Rotation.from_quat(row[3:]).as_matrix(), row[:3]
@@ -54,4 +55,5 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=5000.0,
         read_pose=read,
         camera=DefaultCamera(_CAMERA, "ICL-NUIM's renderer", sure=True),
+        findings=miscounted_poses([one in rows for one in numbers], len(rows)),
     )

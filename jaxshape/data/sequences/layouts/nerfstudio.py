@@ -74,7 +74,11 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=_depth_scale(about, files, source),
         read_pose=read,
         calibration=_calibration(about, frames, files, source),
-        findings=(*_left_out(len(depth) - len(kept)), *_distorted(about, frames, source)),
+        findings=(
+            *_left_out(len(depth) - len(kept)),
+            *_without_colors(frames, files, source),
+            *_distorted(about, frames, source),
+        ),
     )
 
 
@@ -179,6 +183,25 @@ def _left_out(count: int) -> tuple[Finding, ...]:
     if not count:
         return ()
     return (Finding(f"{count} frames have no depth image", "They are left out."),)
+
+
+def _without_colors(
+    frames: list[dict[str, Any]], files: list[FrameFiles], source: Path
+) -> tuple[Finding, ...]:
+    missing = [
+        frame["file_path"]
+        for frame, one in zip(frames, files, strict=True)
+        if frame.get("file_path") and one.color is None
+    ]
+    if not missing:
+        return ()
+    return (
+        Finding(
+            f"{len(missing)} colour images that {source.name} names do not exist, {missing[0]} "
+            "among them",
+            "Copy them to the recording; until then these frames have no colour.",
+        ),
+    )
 
 
 def _distorted(

@@ -18,6 +18,7 @@ from jaxshape.data.sequences.listing import (
     frame_files,
     has_depth_folder,
     last_number,
+    miscounted_poses,
     partners,
 )
 from jaxshape.data.sequences.poses import from_opengl, from_quaternions, known
@@ -71,6 +72,7 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=usual_depth_scale(depth.values()),
         read_pose=read,
         calibration=_calibration(about, numbers, source),
+        findings=miscounted_poses([0 <= one < len(T) for one in numbers], len(T)),
     )
 
 

@@ -37,5 +37,5 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=1000.0,
         read_pose=(lambda index: read_pose(poses[index])) if any(poses) else None,
         calibration=Calibration(K[None], None, _CAMERA),
-        findings=miscounted_poses(poses, len(offered)),
+        findings=miscounted_poses(map(bool, poses), len(offered)),
     )

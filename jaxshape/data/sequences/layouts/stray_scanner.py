@@ -18,6 +18,7 @@ from jaxshape.data.sequences.listing import (
     frame_files,
     has_depth_folder,
     last_number,
+    miscounted_poses,
     partners,
 )
 from jaxshape.data.sequences.poses import from_quaternions, known
@@ -65,7 +66,10 @@ def list_frames(contents: Contents) -> Listed:
         read_pose=read,
         times=times if rising else None,
         calibration=_calibration(contents, columns, rows, color),
-        findings=_without_film(contents) if not any(color) else (),
+        findings=(
+            *(_without_film(contents) if not any(color) else ()),
+            *miscounted_poses([row >= 0 for row in rows], len(row_of)),
+        ),
     )
 
 

@@ -15,6 +15,7 @@ from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
     color_images,
+    list_folder,
     mask_images,
     partners,
     with_colors_by_time,
@@ -60,7 +61,7 @@ def list_frames(contents: Contents) -> Listed:
         times=times,
         color_delays=delays,
         camera=_camera_of(folder),
-        findings=doubts,
+        findings=(*doubts, *_unlisted(depth)),
     )
 
 
@@ -81,6 +82,22 @@ def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
     return np.array([time for time, _ in pairs]), [
         below(path.parent, file, path) for _, file in pairs
     ]
+
+
+def _unlisted(depth: list[Path]) -> tuple[Finding, ...]:
+    """A remark on depth images beside those of the list."""
+    beside = depth[0].parent
+    if not beside.is_dir():
+        return ()
+    files = [name for name in list_folder(beside).files if name.endswith(depth[0].suffix)]
+    if (count := len(set(files) - {path.name for path in depth})) == 0:
+        return ()
+    return (
+        Finding(
+            f"{count} of {len(files)} images in {beside.name}/ are not listed in depth.txt",
+            "They are left out; list them, if they belong to the recording.",
+        ),
+    )
 
 
 def check_rising(times: Float[np.ndarray, " n"], path: Path) -> None:

@@ -12,6 +12,7 @@ from jaxshape.data.sequences.listing import (
     frame_files,
     has_depth_folder,
     last_number,
+    miscounted_poses,
 )
 from jaxshape.data.sequences.poses import known
 
@@ -45,6 +46,7 @@ def list_frames(contents: Contents) -> Listed:
         depth_scale=1000.0,
         read_pose=read,
         calibration=_calibration(contents),
+        findings=miscounted_poses([one in poses for one in numbers], len(poses)),
     )
 
 
