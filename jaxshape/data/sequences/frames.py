@@ -293,7 +293,8 @@ def read_color(path: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 
 
 
 def read_mask(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Read a mask, True where not black, scaled to `shape`; raises as `read_color` does."""
+    """Read a mask, True where neither black nor transparent, scaled to `shape`; raises as
+    `read_color` does."""
     pixels = _mask_pixels(path, shape)
     return pixels != 0 if pixels.ndim == 2 else (pixels != 0).any(axis=-1)
 
@@ -316,15 +317,29 @@ def read_instances(path: Picture, shape: tuple[int, int]) -> Int[np.ndarray, "h 
 def _mask_pixels(path: Picture, shape: tuple[int, int]) -> np.ndarray:
     with opened(path) as image:
         _check_aspect(image, shape, path)
-        opaque = image.convert("RGB") if _is_painted(image) else image
-        return np.array(opaque.resize((shape[1], shape[0]), Image.Resampling.NEAREST))
+        return np.array(_black_around(image).resize((shape[1], shape[0]), Image.Resampling.NEAREST))
+
+
+def _black_around(image: Image.Image) -> Image.Image:
+    """The image of a mask, black but for the objects.
+
+    If some pixels are transparent, the others are the object. In a JPEG, the object is what has a
+    quarter of the largest brightness: compression leaves traces around it.
+    """
+    if image.format in ("JPEG", "MPO"):
+        gray = np.array(image.convert("L"))
+        return Image.fromarray(gray > gray.max() // 4)
+    if image.mode in ("LA", "PA", "RGBA"):
+        opacity = np.array(image.getchannel("A"))
+        return image.convert("RGB") if opacity.all() else Image.fromarray(opacity > 0)
+    return image.convert("RGB") if _is_painted(image) else image
 
 
 def _is_painted(image: Image.Image) -> bool:
-    """Whether only the colours of an image tell what is black, and not its numbers: it has opacity,
-    or a palette in which black is not the first colour."""
+    """Whether only the colours of an image tell what is black, and not its numbers: it has a
+    palette in which black is not the first colour."""
     if image.mode != "P":
-        return image.mode in ("LA", "RGBA")
+        return False
     palette = image.getpalette() or []
     used = [palette[3 * i : 3 * i + 3] for i in np.unique(np.array(image)).tolist()]
     return palette[:3] != [0, 0, 0] and [0, 0, 0] in used

@@ -319,6 +319,36 @@ def test_a_mask_with_a_palette_is_what_is_not_black(tmp_path):
         np.testing.assert_array_equal(frame.mask, mask)
 
 
+@pytest.mark.parametrize("quality", [75, 95])
+def test_traces_around_the_object_in_a_jpeg_are_not_its_mask(tmp_path, quality):
+    write_bundlesdf(tmp_path, SEEN)
+    mask = np.zeros((H, W), bool)
+    mask[13:30, 9:42] = True
+    for i, shape in enumerate((mask, ~mask, mask & False)):
+        (tmp_path / f"masks/{i:05d}.png").unlink()
+        image = Image.fromarray(shape.astype(np.uint8) * 255)
+        image.save(tmp_path / f"masks/{i:05d}.jpg", quality=quality)
+        frame = open_sequence(tmp_path)[i]
+        np.testing.assert_array_equal(frame.mask, shape)
+        assert frame.instances is None
+
+
+@pytest.mark.parametrize("hidden", [0, 255])
+@pytest.mark.parametrize("mode", ["RGBA", "LA"])
+def test_transparent_pixels_are_not_the_object(tmp_path, mode, hidden):
+    """Programs that cut an object out leave any colour in the pixels that they hide."""
+    write_bundlesdf(tmp_path, SEEN)
+    mask = np.zeros((H, W), bool)
+    mask[10:30, 10:30] = True
+    gray = np.where(mask, 255 - hidden, hidden).astype(np.uint8)
+    image = Image.merge("LA", [Image.fromarray(one) for one in (gray, mask * np.uint8(255))])
+    path = tmp_path / "masks/00000.png"
+    image.convert(mode).save(path)
+    np.testing.assert_array_equal(open_sequence(tmp_path)[0].mask, mask)
+    Image.fromarray(mask).convert("RGBA").save(path)  # opaque, so that black is around the object
+    np.testing.assert_array_equal(open_sequence(tmp_path)[0].mask, mask)
+
+
 def test_colours_of_another_aspect_are_left_out_and_said(tmp_path):
     seen = SEEN._replace(color=np.zeros((6, 72, 128, 3), np.uint8))
     write_bundlesdf(tmp_path, seen)
