@@ -21,6 +21,9 @@ from jaxshape.data.sequences.listing import number_pattern
 SAMPLES = 12
 """Number of frames, spread over a recording, whose images are read."""
 
+_COMMON = 0.01
+"""Share of the valid pixels from which on they hold the same number hardly by chance."""
+
 
 class Gap(NamedTuple):
     """Missing frames, between two frames with neighbouring numbers or times.
@@ -46,6 +49,8 @@ class Depths(NamedTuple):
         sampled: Number of sampled images that could be read.
         black: Number of these images without any valid pixel.
         damaged: A sentence for each image that could not be read.
+        beyond: A number that far more pixels hold than depths near it, as where nothing was
+            measured, and the share of the valid pixels that hold it; None without one.
     """
 
     median: float
@@ -54,6 +59,7 @@ class Depths(NamedTuple):
     sampled: int
     black: int
     damaged: tuple[str, ...]
+    beyond: tuple[float, float] | None = None
 
 
 class Poses(NamedTuple):
@@ -99,7 +105,22 @@ def depths_of(sequence: Sequence) -> Depths:
         sampled=len(raw),
         black=int(np.sum(~valid.any(axis=(1, 2)))),
         damaged=tuple(map(str, damaged)),
+        beyond=_beyond(values[valid]),
     )
+
+
+def _beyond(values: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
+    """The largest number of a hundredth of the values or more, and its share, if hardly any other
+    value is above its half."""
+    values = values[:: max(1, len(values) // 200_000)]
+    numbers, counts = np.unique(values, return_counts=True)
+    common = numbers[counts >= _COMMON * len(values)]
+    if not len(common):
+        return None
+    number = float(common[-1])
+    share = float(np.mean(values == number))
+    others = float(np.mean((values > number / 2) & (values != number)))
+    return (number, share) if share < 1 and others < _COMMON * share else None
 
 
 def _thinned(pixels: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -225,6 +225,10 @@ def read_raw_depth(path: Picture, shape: tuple[int, int]) -> Float[np.ndarray, "
                 f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the first depth "
                 "image: scale it to that size, or remove it."
             )
+        if getattr(image, "is_animated", False):
+            raise SequenceError(
+                f"{path} holds several images; expected one: save each to a file of its own."
+            )
         if image.mode not in ("I;16", "I;16B", "I", "F"):
             raise SequenceError(
                 f"{path} has Pillow mode {image.mode}; expected a depth image with one channel of "
@@ -287,6 +291,8 @@ def read_color(path: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 
     """Read a colour image, scaled to `shape`; `SequenceError` if damaged or of another aspect."""
     with opened(path) as image:
         _check_aspect(image, shape, path)
+        if image.mode in ("I;16", "I;16B", "I"):  # Pillow would cut at 255
+            image = Image.fromarray(np.clip(np.array(image) >> 8, 0, 255).astype(np.uint8))
         color = image if image.mode == "RGB" else image.convert("RGB")
         scaled = color.resize((shape[1], shape[0]), Image.Resampling.BILINEAR)
     return np.array(scaled)

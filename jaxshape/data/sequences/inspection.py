@@ -144,6 +144,15 @@ def _of_images(depths: Depths, pictures: tuple[str, ...]) -> Iterator[Finding]:
             "unseen.",
         )
 
+    if depths.beyond is not None:
+        number, share = depths.beyond
+        yield Finding(
+            f"{share:.0%} of the valid depth pixels hold the number {number:g}, and hardly any "
+            "other is above its half",
+            "If it stands for nothing measured, write 0 there: otherwise all before it counts as "
+            "free.",
+        )
+
 
 # Depth scale and camera ------------------------------------------------------------------------
 

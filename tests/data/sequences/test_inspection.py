@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from PIL import Image
 from recordings import WRITERS, H, K, W, record, save, write_7_scenes, write_redwood, write_tum
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +30,7 @@ def test_a_good_recording(tmp_path, name):
     assert found.warnings == () and found.gaps == ()
     assert (found.colors, found.masks) == (12, 12)
     assert found.depths.median == pytest.approx(np.median(SEEN.depth))
-    assert found.depths[1:] == (0, 0, 12, 0, ())
+    assert found.depths[1:] == (0, 0, 12, 0, (), None)
     steps = np.diff(SEEN.T_world_camera[:, :3, 3], axis=0)
     assert found.poses.known == 12 and found.poses.damaged == ()
     assert found.poses.length == pytest.approx(np.linalg.norm(steps, axis=1).sum(), rel=1e-4)
@@ -126,6 +127,19 @@ def test_damaged_black_and_saturated_images(tmp_path):
     assert "sampled depth images that cannot be used: 1; " in warnings
     assert "7 of 11 sampled depth images hold no valid depth" in warnings
     assert "64% of the depth pixels hold nothing, 55% are saturated" in warnings
+
+
+@pytest.mark.parametrize("number, share", [(32767, 0.05), (32767, 0.7), (10000, 0.3), (4000, 0.3)])
+def test_a_number_for_nothing_measured_is_named(tmp_path, number, share):
+    write_7_scenes(tmp_path, SEEN)
+    assert inspect_sequence(open_sequence(tmp_path)).depths.beyond is None
+    rng = np.random.default_rng(0)
+    for path in tmp_path.glob("*.depth.png"):
+        depth = np.array(Image.open(path))
+        save(path, np.where(rng.random(depth.shape) < share, np.uint16(number), depth))
+    found = inspect_sequence(open_sequence(tmp_path))
+    said = [one.evidence for one in found.warnings if f"the number {number}" in one.evidence]
+    assert len(said) == (number > 4000)  # the depths are 1.5 to 3.3 m
 
 
 def test_damaged_colours_and_masks(tmp_path):

@@ -349,6 +349,24 @@ def test_transparent_pixels_are_not_the_object(tmp_path, mode, hidden):
     np.testing.assert_array_equal(open_sequence(tmp_path)[0].mask, mask)
 
 
+def test_gray_of_16_bits_keeps_its_shades(tmp_path):
+    write_bundlesdf(tmp_path, SEEN)
+    gray = SEEN.color[0, ..., 0]
+    save(tmp_path / "rgb/00000.png", gray.astype(np.uint16) << 8)
+    np.testing.assert_array_equal(open_sequence(tmp_path)[0].color, np.dstack([gray] * 3))
+
+
+def test_a_stack_of_depth_images_in_one_file_is_not_read_as_one(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    (tmp_path / "depth/depth_1.png").unlink()
+    first, *others = (Image.fromarray(raw(depth, 1000)) for depth in SEEN.depth)
+    first.save(tmp_path / "depth/depth_1.tif", save_all=True, append_images=others)
+    sequence = open_sequence(tmp_path)
+    assert sequence[0].depth.any() and sequence[2].depth.any()
+    with pytest.raises(SequenceError, match="holds several images; expected one"):
+        sequence[1]
+
+
 def test_colours_of_another_aspect_are_left_out_and_said(tmp_path):
     seen = SEEN._replace(color=np.zeros((6, 72, 128, 3), np.uint8))
     write_bundlesdf(tmp_path, seen)
