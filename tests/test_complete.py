@@ -43,7 +43,7 @@ def test_complete_writes_a_mesh_where_the_cloud_lies(run, scan, tmp_path, linear
 def test_what_cannot_be_completed_is_refused(run, scan, tmp_path, linear_weights):
     options = ("--weights", linear_weights, "--output", tmp_path / "out")
     for arguments, said in (
-        ((tmp_path / "none.ply",), "cannot be read as a point cloud"),
+        ((tmp_path / "none.ply",), "There is no file"),
         ((scan, "--up", "y", "--front", "-y"), "must be perpendicular"),
         ((scan, "--sensor", "nan", "0", "0"), "not finite"),
     ):

@@ -55,6 +55,8 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
         ValueError: The file is of another kind, damaged, or holds too few points.
     """
     path = Path(path)
+    if not path.exists():
+        raise ValueError(f"There is no file {path}; give a point cloud, .ply or .pcd.")
     kind = path.suffix.lower()
     if kind not in SUFFIXES:
         raise ValueError(f"{path} is no point cloud; expected {' or '.join(SUFFIXES)}: convert it.")
@@ -73,7 +75,33 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
             f"{path} holds {len(cloud.points)} usable points; expected {FEWEST} or more, of one "
             "object."
         )
+    if cloud.sensor is not None and surrounds(without_strays(cloud).points, cloud.sensor):
+        return cloud._replace(sensor=None)  # the cloud was moved after it was measured
     return cloud
+
+
+def surrounds(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, " 3"]) -> bool:
+    """Whether a place lies between the points along every axis.
+
+    Args:
+        points: The points.
+        place: The place, in their frame.
+    """
+    return bool(((points.min(axis=0) < place) & (place < points.max(axis=0))).all())
+
+
+def without_strays(cloud: Cloud) -> Cloud:
+    """The cloud without points that are farther from all but a hundredth of the others than these
+    are from each other, as when a pixel at an edge is measured in the air.
+
+    Args:
+        cloud: The cloud.
+    """
+    low, high = np.quantile(cloud.points, (0.01, 0.99), axis=0)
+    reach = (high - low).max()
+    kept = ((cloud.points > low - reach) & (cloud.points < high + reach)).all(axis=1)
+    normals = None if cloud.normals is None else cloud.normals[kept]
+    return cloud._replace(points=cloud.points[kept], normals=normals)
 
 
 def _read_ply(content: bytes, seed: int) -> Cloud:

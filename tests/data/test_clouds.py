@@ -70,6 +70,13 @@ def test_all_rows_of_an_organised_pcd_are_read_or_it_is_refused(tmp_path):
         read_cloud(file)
 
 
+def test_a_viewpoint_within_the_points_is_not_used(tmp_path):
+    """A cloud that was moved to its centre, with the place from where it was measured before."""
+    middle = " ".join(map(str, POINTS.mean(axis=0)))
+    write_pcd(tmp_path / "scan.pcd", "binary", viewpoint=f"{middle} 1 0 0 0")
+    assert read_cloud(tmp_path / "scan.pcd").sensor is None
+
+
 def test_references_that_overlap_repeat_what_they_write():
     header = b"FIELDS x y z\nSIZE 1 1 1\nTYPE U U U\nWIDTH 9\nDATA binary_compressed\n"
     block = bytes([2, 1, 2, 3]) + bytes([7 << 5, 24 - 2 - 7, 2])  # 1 2 3, then 24 bytes 3 back

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxshape.data.boxes import Box
-from jaxshape.data.clouds import Cloud
+from jaxshape.data.clouds import Cloud, surrounds, without_strays
 from jaxshape.data.meshes import axes_to_canonical
 from jaxshape.geometry import fusion
 from jaxshape.geometry.grid import GridFrame
@@ -79,7 +79,8 @@ def place_cloud(
 ) -> PlacedCloud:
     """Find the object's frame and box, with the up direction that fits best.
 
-    A cloud whose size in metres is not plausible for the object is scaled to the usual size.
+    A cloud whose size in metres is not plausible for the object is scaled to the usual size. Single
+    points far from all others do not count.
 
     Args:
         cloud: The cloud.
@@ -89,9 +90,22 @@ def place_cloud(
         seed: Seed of the points that are drawn, 0 or more.
 
     Raises:
-        ValueError: The axes are not perpendicular, or nothing can be placed.
+        ValueError: The axes are not perpendicular, the sensor lies in the object, or nothing can be
+            placed.
     """
     config, warnings = SEARCH, []
+    every, cloud = len(cloud.points), without_strays(cloud)
+    if strays := every - len(cloud.points):
+        warnings.append(f"{strays} points lie far away from all others and are left out.")
+    if cloud.sensor is not None and surrounds(cloud.points, cloud.sensor):
+        low, high = (
+            " ".join(f"{x:.3g}" for x in f(cloud.points, axis=0)) for f in (np.min, np.max)
+        )
+        raise ValueError(
+            f"The sensor at {' '.join(f'{x:.3g}' for x in cloud.sensor)} lies within the object, "
+            f"whose points reach from {low} to {high}; expected a place outside, in the frame and "
+            "the unit of the file: correct --sensor, or leave it out."
+        )
     metres = _metres(cloud, config)
     if metres != 1:
         extent = np.ptp(cloud.points, axis=0).max()

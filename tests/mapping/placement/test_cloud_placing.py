@@ -6,7 +6,7 @@ import pytest
 
 from jaxshape.data.boxes import Box
 from jaxshape.data.chairs import random_chair
-from jaxshape.data.clouds import Cloud
+from jaxshape.data.clouds import Cloud, without_strays
 from jaxshape.data.meshes import axes_to_canonical, sample_oriented
 from jaxshape.geometry.grid import GridFrame
 from jaxshape.mapping.placement.cloud_placing import PlacedCloud, cloud_grids, place_cloud
@@ -80,6 +80,25 @@ def test_a_chair_is_placed_as_it_stands(up, front, unit):
     np.testing.assert_allclose(T[:3, :3], R_file_object, atol=0.1)
     np.testing.assert_allclose(T[:3, 3], [0.3, -2.0, 1.0], atol=0.05)
     np.testing.assert_allclose(found.box.size, mesh.extents, atol=0.08)
+
+
+def test_a_sensor_within_the_object_is_refused():
+    """The place where a cloud was centred, or metres beside a cloud in millimetres."""
+    points = 1000 * wall() @ np.array([[1, 0, 0], [0, 1, 0.5], [0, 0, 1]])
+    for place in ((0.0, 0.0, 20.0), points.mean(axis=0), (0.3, 0.2, 1.5)):
+        with pytest.raises(ValueError, match=r"within the object, whose points reach from -300"):
+            place_cloud(Cloud(points, None, np.array(place)), load_prior("chair-autoencoder"))
+
+
+def test_points_far_from_all_others_do_not_count():
+    normals = np.repeat([[0.0, 0.0, 1.0]], 40_000, 0)
+    cloud = Cloud(wall(), normals, None)
+    assert len(without_strays(cloud).points) == 40_000
+    far = np.array([[6.0, 0, 0], [0, -9, 0], [0, 0, 1e6]])
+    many = Cloud(np.concatenate([far, wall()]), np.concatenate([normals[:3], normals]), None)
+    kept = without_strays(many)
+    np.testing.assert_array_equal(kept.points, cloud.points)
+    assert kept.normals is not None and len(kept.normals) == 40_000
 
 
 def test_axes_that_are_not_perpendicular_are_refused():
