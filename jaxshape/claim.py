@@ -24,12 +24,14 @@ class Output(NamedTuple):
         is_file: Whether it is one file.
         goes_on: Whether the same command, given again, resumes where it was stopped.
         needs: Free bytes that the disk must have at the start.
+        reads: Folder that the command reads, into which it does not write; None for none.
     """
 
     path: Path
     is_file: bool = False
     goes_on: bool = False
     needs: int = FREE_BYTES
+    reads: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -55,8 +57,8 @@ def claimed(output: Output) -> Iterator[None]:
         output: The output to claim.
 
     Raises:
-        OutputError: The output cannot be written, its disk has too little space, or another process
-            is writing it.
+        OutputError: The output cannot be written, is what the command reads, its disk has too
+            little space, or another process is writing it.
     """
     _check_kind(output)
     made = [one for one in (output.folder, *output.folder.parents) if not one.exists()]
@@ -83,6 +85,11 @@ def _check_kind(output: Output) -> None:
         raise OutputError(f"{str(output.path)!r} is a folder; give the name of a file in it.")
     if not output.is_file and output.path.exists() and not output.path.is_dir():
         raise OutputError(f"{str(output.path)!r} is a file; give a folder as --output.")
+    if output.reads is not None and output.path.resolve() == output.reads.resolve():
+        raise OutputError(
+            f"{str(output.path)!r} is the recording itself, whose files could be overwritten; give "
+            "another folder as --output."
+        )
 
 
 def _check_space(output: Output) -> None:

@@ -174,6 +174,23 @@ def test_a_recording_in_which_nothing_stands_out_is_refused(frames, refused, lin
     assert "Nothing but floor, walls and table tops is seen" in said
 
 
+def test_a_recording_is_not_written_into(frames, run, linear):
+    before = {path.name: path.read_bytes() for path in frames.iterdir()}
+    for command in ("reconstruct", "scene"):
+        given = linear if command == "reconstruct" else ()
+        status, out, err = run(command, *given, frames, "--output", frames / ".." / "frames")
+        assert status == 2 and not out and "is the recording itself" in err
+    assert {path.name: path.read_bytes() for path in frames.iterdir()} == before
+
+
+def test_poses_that_are_all_lost_are_refused_with_what_to_do(frames, refused, linear):
+    for path in frames.glob("*.pose.txt"):
+        np.savetxt(path, np.full((4, 4), np.nan))
+    for box in ((), ("--box", frames / "box.json")):
+        said = refused("reconstruct", *linear, frames, *box)
+        assert "add --poses none to track the camera" in said
+
+
 def test_poses_that_are_missing_or_do_not_fit_are_refused(frames, refused, linear):
     some = ("reconstruct", *linear, frames, "--box", frames / "box.json")
     paths = sorted(frames.glob("*.pose.txt"))
@@ -215,6 +232,7 @@ def chair(tmp_path_factory):
         (("--first", "3"), "--first is 3, but there are 3 frames"),
         (("--depth-scale", "0"), "The depth scale is 0"),
         (("--click", "48", "20"), "The click is at 48, 20"),
+        (("--object", "0"), "--object is 0; give a whole number, 1 or more"),
         (("--region", "60", "0", "70", "10"), "holds no pixel of the image of 48 x 48"),
         (("--region", "30", "0", "20", "10"), "--region is 30.0 0.0 20.0 10.0"),
         (("--depth-range", "2", "1"), "--depth-range is 2.0 1.0"),

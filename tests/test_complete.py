@@ -52,6 +52,15 @@ def test_what_cannot_be_completed_is_refused(run, scan, tmp_path, linear_weights
     assert not (tmp_path / "out").exists()
 
 
+def test_a_cloud_is_not_overwritten_by_its_completion(run, scan, linear_weights):
+    cloud = scan.rename(scan.with_name("mesh.ply"))
+    content = cloud.read_bytes()
+    options = ("--weights", linear_weights, "--output", cloud.parent)
+    status, out, err = run("complete", cloud, *options)
+    assert status == 2 and not out and "would be overwritten" in err
+    assert cloud.read_bytes() == content
+
+
 def test_a_list_of_objects_numbers_them_on_a_picture(run, tmp_path, linear_weights):
     write_scene(tmp_path / "frames", random_chair(2, style="side chair"), frames=1)
     options = ("--weights", linear_weights, "--output", tmp_path / "out")

@@ -56,6 +56,11 @@ class Complete(Rebuild):
         from jaxshape.results.summary import verdict_in_words
         from jaxshape.search.reconstruction import require_measured
 
+        mesh = self.output / "mesh.ply"
+        require(
+            self.scan.resolve() != mesh.resolve(),
+            f"{str(self.scan)!r} would be overwritten by the result; give another --output.",
+        )
         cloud = read_cloud(self.scan, seed=self.seed)
         if self.sensor is not None:
             require(bool(np.isfinite(self.sensor).all()), "--sensor is not finite; give x y z.")

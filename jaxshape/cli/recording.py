@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from jaxshape import checks
 from jaxshape.claim import Output
 from jaxshape.cli.common import console, progress_bar, require, warn
 from jaxshape.cli.opening import Recorded
@@ -59,12 +60,14 @@ class Reconstruct(Rebuild, Recorded):
 
     def __post_init__(self) -> None:
         Recorded.__post_init__(self)
+        if self.object is not None:
+            checks.whole("object", self.object, 1)
         Rebuild.__post_init__(self)
 
     @property
     def writes(self) -> Output:
         """The output folder."""
-        return Output(self.output, goes_on=True)
+        return Output(self.output, goes_on=True, reads=self.frames)
 
     def run(self) -> None:
         start = time.perf_counter()

@@ -51,7 +51,7 @@ class BuildScene(Recorded):
     @property
     def writes(self) -> Output:
         """The output folder."""
-        return Output(self.output)
+        return Output(self.output, reads=self.frames)
 
     def run(self) -> None:
         start = time.perf_counter()

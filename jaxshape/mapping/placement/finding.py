@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxshape import checks
 from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Frame, Sequence, SequenceError
 from jaxshape.mapping.placement import placing
@@ -57,6 +58,7 @@ _NEARLY_LEVEL = np.cos(np.radians(50))  # largest angle by which people tilt cam
 _FLOOR_MARGIN = 0.02  # metres above the floor below which nothing counts as the object
 _STEP = 0.04  # metres: least difference in height between two distinct floors
 _USUAL = PlacementConfig()
+_WITHOUT_POSES = "add --poses none to track the camera from the first frame on"
 _ROOM = 0.15  # share by which an estimated box is enlarged before it cuts out the object
 
 
@@ -135,13 +137,18 @@ def find_start(
     Raises:
         SequenceError: No frame shows the object well enough, can be read, or has a pose where poses
             are used.
-        ValueError: No pixel of the image can meet the prompt.
+        ValueError: No pixel of the image can meet the prompt, or there is no first frame.
     """
+    checks.whole("first", first, 0, len(sequence) - 1, "the recording has no more frames")
     use_pose = use_pose and sequence.has_poses
     if box is not None:
         index, frame = first_readable(sequence, first, use_pose)
         T = _world_pose(frame, use_pose)
-        return Start(index, frame.mask, frame.mask, box, T, None, np.nan, None, (), ())
+        said = (
+            f"The map begins with {frame.name}: {index - first} frames before it cannot be read or "
+            "have no pose.",
+        ) * (index > first)
+        return Start(index, frame.mask, frame.mask, box, T, None, np.nan, None, said, said)
     reasons = []
     for index in range(first, min(first + FIRST_FRAMES, len(sequence))):
         try:
@@ -150,7 +157,7 @@ def find_start(
             reasons.append(f"{sequence.names[index]}: {problem}")
             continue
         if use_pose and frame.T_world_camera is None:
-            reasons.append(f"{frame.name}: It has no pose.")
+            reasons.append(f"{frame.name}: It has no pose; {_WITHOUT_POSES}.")
             continue
         found = segment(frame.depth, frame.color, frame.intrinsics, prompt, frame.mask)
         if found.confidence >= (SURE_OF_PROMPT if _is_prompted(prompt) else SURE):
@@ -188,7 +195,7 @@ def first_readable(sequence: Sequence, first: int, use_pose: bool) -> tuple[int,
             continue
         if not use_pose or frame.T_world_camera is not None:
             return index, frame
-    raise problem or SequenceError("No frame of the recording has a pose.")
+    raise problem or SequenceError(f"No frame from number {first} on has a pose; {_WITHOUT_POSES}.")
 
 
 def _world_pose(frame: Frame, use_pose: bool) -> Float[np.ndarray, "4 4"]:

@@ -246,7 +246,12 @@ def test_with_a_box_the_first_frame_that_can_be_read_is_the_first(begin, copy):
     (copy / "frame-000001.pose.txt").unlink()
     _, start = begin(copy)
     assert start.index == 2 and start.T_level_world is None
-    assert begin(copy, first=5)[1].index == 5
+    said = "The map begins with frame-000002: 2 frames before it cannot be read or have no pose."
+    assert start.warnings == (said,)
+    fifth = begin(copy, first=5)[1]
+    assert fifth.index == 5 and not fifth.warnings
+    with pytest.raises(ValueError, match="first is 99; give a whole number, 0 to 13"):
+        begin(copy, first=99)
     for path in copy.glob("*.depth.png"):
         path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(SequenceError, match="cannot be read as an image"):
