@@ -11,6 +11,7 @@ from jaxshape.data.sequences.frames import (
     SATURATED,
     Sequence,
     SequenceError,
+    depth_scale_fault,
     read_color,
     read_mask,
     read_raw_depth,
@@ -88,18 +89,27 @@ class Poses(NamedTuple):
 
 def depths_of(sequence: Sequence) -> Depths:
     """Statistics of sampled depth images; raises the first `SequenceError` if none can be read."""
-    raw, damaged = [], []
+    raw, read, damaged = [], [], []
     for index in _sampled(sequence):
+        picture = sequence.files[index].depth
         try:
-            raw.append(_thinned(read_raw_depth(sequence.files[index].depth, sequence.shape)))
+            raw.append(_thinned(read_raw_depth(picture, sequence.shape)))
+            read.append(picture)
         except SequenceError as error:
             damaged.append(error)
     if not raw:
         raise damaged[0]
     values = np.stack(raw)
     valid = (values > 0) & (values < SATURATED)
+    scale = sequence.depth_scale
+    median = float(np.median(values[valid])) / scale if valid.any() else 0.0
+    for picture, image, known in zip(read, values, valid, strict=True):
+        own = float(np.median(image[known])) / scale if known.any() else median
+        fault = depth_scale_fault(own, scale)
+        if fault is not None and not median / 10 < own < median * 10:  # this image alone
+            damaged.append(f"{picture}: {fault.sentence}")
     return Depths(
-        median=float(np.median(values[valid])) / sequence.depth_scale if valid.any() else 0.0,
+        median=median,
         invalid=float(np.mean(~valid)),
         saturated=float(np.mean(values >= SATURATED)),
         sampled=len(raw),

@@ -129,6 +129,18 @@ def test_damaged_black_and_saturated_images(tmp_path):
     assert "64% of the depth pixels hold nothing, 55% are saturated" in warnings
 
 
+def test_single_images_of_another_unit_are_named(tmp_path):
+    write_7_scenes(tmp_path, SEEN)
+    save(tmp_path / "frame-000003.depth.png", (SEEN.depth[3] * 20).astype(np.uint16))
+    found = inspect_sequence(open_sequence(tmp_path))
+    assert (
+        len(found.depths.damaged) == 1 and "frame-000003.depth.png: the" in found.depths.damaged[0]
+    )
+    assert any(
+        "sampled depth images that cannot be used: 1" in one.evidence for one in found.warnings
+    )
+
+
 @pytest.mark.parametrize("number, share", [(32767, 0.05), (32767, 0.7), (10000, 0.3), (4000, 0.3)])
 def test_a_number_for_nothing_measured_is_named(tmp_path, number, share):
     write_7_scenes(tmp_path, SEEN)

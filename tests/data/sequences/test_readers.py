@@ -593,6 +593,13 @@ def test_a_first_colour_that_is_damaged_costs_its_frame_alone(tmp_path, name, fo
     np.testing.assert_array_equal(after[1].color, before[1].color)
 
 
+def test_depth_images_without_their_folder_are_not_taken_for_painted_ones(tmp_path):
+    write_scannet(tmp_path / "scan", SEEN)
+    for path in (tmp_path / "scan/depth").iterdir():
+        path.rename(path.with_stem(f"depth_{path.stem}"))
+    assert f"give {tmp_path / 'scan'}, which fits" in fault_of(tmp_path / "scan/depth")
+
+
 def test_raw_depth_that_cannot_be_read_ends_in_one_sentence(tmp_path):
     (tmp_path / "a_Depth_10.png").write_bytes(b"")
     assert "rs-convert -r" in fault_of(tmp_path)

@@ -16,10 +16,11 @@ _SIZES = (
 )  # fmt: skip
 """Width and height of the depth images of these cameras; all have different numbers of pixels."""
 
-_RAW, _PAINTED, _COLOR = (
+_RAW, _COLOR = (
     re.compile(rf"(?:.*_)?{stem}_(\d+(?:\.\d*)?)\.{end}$", re.IGNORECASE)
-    for stem, end in (("Depth", "raw"), ("Depth", "png"), ("Color", "png"))
+    for stem, end in (("Depth", "raw"), ("Color", "png"))
 )
+_PAINTED = re.compile(r".+_Depth_(\d+(?:\.\d*)?)\.png$")  # not depth_12.png, which is depth
 _Timed = list[tuple[float, Path]]
 
 
