@@ -37,7 +37,7 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.config import TrainConfig
 from jaxshape.model.families import Batch, family_of
-from jaxshape.model.shapes import ShapeModel, ShapePrior, decode, encode
+from jaxshape.model.shapes import ShapeModel, ShapePrior, decode_prepared, encode
 from jaxshape.model.weights import fingerprint, flatten
 
 
@@ -236,9 +236,9 @@ def validate(
     family_model: ShapeModel, params: PyTree, batch: Batch
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean IoU of the decoded first codes, everywhere and in occluded voxels."""
-    unused = jnp.zeros(1)
-    prior = ShapePrior(family_model, params, unused, unused[None])
-    completed = decode(prior, family_model.encode(params, batch.grids), batch.grids) > 0
+    prepared = family_model.prepare(params, batch.grids, "float32")
+    code = family_model.encode(params, batch.grids)
+    completed = decode_prepared(family_model, prepared, code) > 0
     hidden = batch.occluded > 0.5
     return jnp.mean(iou(completed, batch.surface)), jnp.mean(
         iou(completed & hidden, batch.surface & hidden)

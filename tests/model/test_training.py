@@ -12,10 +12,11 @@ import tiny_training
 from tiny_training import CONFIG, NUMBERS, OBJECTS, PATHS
 
 from jaxshape.data.config import DATASETS, FAULTLESS, InputConfig
+from jaxshape.geometry.overlap import iou
 from jaxshape.model import autoencoder, training
 from jaxshape.model.config import PRESETS, Architecture, Completion
 from jaxshape.model.families import Batch
-from jaxshape.model.shapes import encode
+from jaxshape.model.shapes import decode, encode
 from jaxshape.model.training import (
     TrainState,
     batch_of,
@@ -360,6 +361,22 @@ def test_the_prior_of_a_completion_network_is_normal(dataset, tmp_path):
     np.testing.assert_array_equal(prior.code_mean, np.zeros(3))
     np.testing.assert_array_equal(prior.code_covariance, np.eye(3))
     jax.tree.map(np.testing.assert_array_equal, prior.params, state.average)
+
+
+@pytest.mark.parametrize("architecture", [CONFIG.architecture, Completion((4, 4, 4), 1, 3)])
+def test_reports_score_the_objects_kept_out(monkeypatch, dataset, tmp_path, architecture):
+    monkeypatch.setattr(training, "validation_size", lambda *_: 2)
+    config = replace(CONFIG, architecture=architecture, steps=1, average=0.5)
+    (report,) = training.train(tmp_path, dataset, config)
+    prior, kept = (
+        training.finished_prior(tmp_path, dataset, config),
+        validation_batch(dataset, config),
+    )
+    completed = np.asarray(decode(prior, encode(prior, kept.grids), kept.grids)) > 0
+    hidden = kept.occluded > 0.5
+    for found, at in ((report.validation_iou, True), (report.validation_occluded, hidden)):
+        expected = np.mean(iou(completed & at, kept.surface & at))
+        assert found == pytest.approx(float(expected), abs=1e-3)
 
 
 def test_weights_of_another_model_are_no_start(linear_prior):
