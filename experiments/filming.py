@@ -1,6 +1,8 @@
-"""Film a mesh by hand: noisy depth images and poses on disk, in the 7-Scenes layout."""
+"""Film meshes: from an orbit, or by hand with images and poses on disk in the 7-Scenes layout."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import jaxlie
@@ -8,8 +10,24 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from jaxshape.data.capture import Capture, camera_distance, capture
+from jaxshape.data.dataset import Object, hash_seed, load_object
+from jaxshape.data.meshes import Model
 from jaxshape.data.render import add_sensor_noise, render_depth
+from jaxshape.data.virtual_cameras import VirtualCamera
+from jaxshape.geometry import camera
 from jaxshape.geometry.camera import Intrinsics
+
+
+def from_orbit(
+    chair: Object, frames: int, device: VirtualCamera, noise: bool = True
+) -> tuple[trimesh.Trimesh, Capture]:
+    """A mesh, and the frames of an orbit at 30 degrees elevation around it."""
+    model = load_object(chair)
+    assert isinstance(model, Model), model
+    T = camera.orbit(frames, camera_distance(model.mesh, device))
+    seed = hash_seed(0, *model.name.encode())
+    return model.mesh, capture(model.mesh, T, noise=noise, seed=seed, camera=device)
 
 
 def film(
@@ -46,3 +64,12 @@ def look_from(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
     return T
+
+
+def among_boxes(
+    meshes: Sequence[trimesh.Trimesh], boxes: Sequence[tuple[tuple, tuple]]
+) -> trimesh.Trimesh:
+    """Meshes together with boxes such as floors and walls, each given by two opposite corners."""
+    around = [trimesh.creation.box(bounds=np.array(corners, float)) for corners in boxes]
+    together: Any = trimesh.util.concatenate([*meshes, *around])
+    return together

@@ -1,9 +1,12 @@
 """Rebuild the object of a recording as `jaxshape reconstruct` does, and judge the result."""
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import runs
 from jaxshape.data.sequences import Sequence
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.doubts import doubts_of, unseen_of
@@ -16,6 +19,16 @@ from jaxshape.results.output import ShapeMesh, only, shape_mesh
 from jaxshape.results.progress import floor_height, observation_of, seen_views
 from jaxshape.results.verdict import judged, quality_of
 from jaxshape.search.config import RefineConfig
+
+
+@dataclass(frozen=True)
+class Config(runs.Config):
+    """Settings of experiments on a recording."""
+
+    recording: Path = Path("kitchen/frames")
+    """A recording with poses."""
+    box: Path = Path("experiments/kitchen_chair_box.json")
+    """The object's box in the world of these poses, measured by hand."""
 
 
 def middle_pixel(shown: np.ndarray) -> tuple[float, float]:
