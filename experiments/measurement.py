@@ -13,7 +13,7 @@ Time: 25 minutes on two cores.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -23,18 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from jaxshape.data.capture import (
-    Capture,
-    camera_distance,
-    capture,
-    fuse_frames,
-    measure_frames,
-    sensor_of,
-)
-from jaxshape.data.dataset import Object, hash_seed, load_object
-from jaxshape.data.meshes import Model
+import runs
+from filming import from_orbit
+from jaxshape.data.capture import Capture, fuse_frames, measure_frames, sensor_of
+from jaxshape.data.dataset import Object
 from jaxshape.data.virtual_cameras import CAMERAS, CameraName
-from jaxshape.geometry import camera, evidence, fusion
+from jaxshape.geometry import evidence, fusion
 from jaxshape.geometry.evidence import Evidence
 from jaxshape.geometry.grids import Grids, binary
 from jaxshape.geometry.overlap import iou
@@ -48,17 +42,13 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for, search_space
 from jaxshape.search.residuals import BALANCED, SOFT, Target
 from jaxshape.search.run import refine
-from study import Claim, conclude, listed
+from study import listed
 
-RESULTS = Path(__file__).parent / "results"
 SEATS_AT_A_TIME = 4
-LEAST = {"F": (0.47, 0.55, 0.65, 0.70), "oracle": (0.88, 0.86, 0.85, 0.86),
-         "refined composed": (0.55, 0.64, 0.70, 0.73)}  # fmt: skip
-"""Targets of signed distances after 1, 4, 8 and 18 noisy frames."""
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
     """Settings of the experiment."""
 
     meshes: Path | None = None
@@ -73,11 +63,6 @@ class Config:
     """Iterations of the search."""
     weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    name: str = "measurement"
-    """Name of the results file."""
-    smoke: bool = False
-    """Two procedural chairs and few iterations, as a test."""
 
 
 class Seen(NamedTuple):
@@ -91,49 +76,46 @@ class Seen(NamedTuple):
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        config = replace(config, meshes=None, chairs=2, frames=(1, 4), iterations=2)
-    journal = run(config)
-    print(table(journal, config))
+    journal = run(config.reduced(meshes=None, chairs=2, frames=(1, 4), iterations=2))
+    for way, scores in means(journal).items():
+        for score, values in scores.items():
+            print(f"{way}, {score}".ljust(32) + "".join(f"{x:8.3f}" for x in values))
 
 
 def run(config: Config) -> Journal:
     """Measure and rebuild every chair both ways, and write the results."""
     prior = load_prior(config.weights)
-    settings = {
-        "set": "procedural" if config.meshes is None else "CAD",
-        "camera": config.camera,
-        "noise": config.noise,
-        "frames": config.frames,
-        "iterations": config.iterations,
-        "weights": fingerprint(prior),
-    }
-    journal = Journal(config.results / f"{config.name}.json", settings)
+    journal = config.journal(
+        "measurement",
+        set="procedural" if config.meshes is None else "CAD",
+        camera=config.camera,
+        noise=config.noise,
+        frames=config.frames,
+        iterations=config.iterations,
+        weights=fingerprint(prior),
+    )
     chairs = listed(config.meshes, config.chairs)[: config.chairs]
     chairs = [chair for chair in chairs if chair.name not in journal.rows]
-    rebuild = rebuilder(prior, config.iterations)
+    rebuild, n = rebuilder(prior, config.iterations), len(config.frames)
     for start in range(0, len(chairs), SEATS_AT_A_TIME):
         began, some = time.perf_counter(), chairs[start : start + SEATS_AT_A_TIME]
         seen = [observe(chair, config) for chair in some]
         filled = (seen * SEATS_AT_A_TIME)[:SEATS_AT_A_TIME]  # one compiled program serves all
         scores = jax.device_get(rebuild(prior, jax.tree.map(lambda *x: np.concatenate(x), *filled)))
-        rows = {}
-        for i, chair in enumerate(some):
-            mine = slice(i * len(config.frames), (i + 1) * len(config.frames))
-            rows[chair.name] = jax.tree.map(lambda x, s=mine: rounded(x[s]), scores)
+        rows = {
+            chair.name: jax.tree.map(lambda x, i=i: rounded(x[i * n : (i + 1) * n]), scores)
+            for i, chair in enumerate(some)
+        }
         journal.add(rows, time.perf_counter() - began)
         print(f"{len(journal.rows)} of {config.chairs}", flush=True)
-    conclude(journal, claims(journal, config), means=means(journal))
+    journal.write({"means": means(journal)})
     return journal
 
 
 def observe(chair: Object, config: Config) -> Seen:
-    """Fuse the first k frames of an orbit at 30 degrees elevation, for every k, both ways."""
-    model, device = load_object(chair), CAMERAS[config.camera]
-    assert isinstance(model, Model), model
-    T = camera.orbit(max(config.frames), camera_distance(model.mesh, device))
-    seed = hash_seed(0, *model.name.encode())
-    captured = capture(model.mesh, T, noise=config.noise, seed=seed, camera=device)
+    """Fuse the first k frames of an orbit, for every k, both ways."""
+    device = CAMERAS[config.camera]
+    _, captured = from_orbit(chair, max(config.frames), device, config.noise)
     points = jax.device_get(_points(captured, config.frames))
     found = jax.device_get(_evidence(captured, config.frames, sensor_of(device)))
     return Seen(points, found, np.stack([np.asarray(captured.surface)] * len(config.frames)))
@@ -165,46 +147,36 @@ def rebuilder(prior: ShapePrior, iterations: int):
     @jax.jit
     def rebuild(prior: ShapePrior, seen: Seen) -> dict[str, dict[str, jax.Array]]:
         score = lambda shape: iou(shape, seen.surface)  # noqa: E731
+
+        def judged(first, logits, composed):
+            return {
+                "first composed": score(composed(first)),
+                "first decoded": score(first > 0),
+                "refined composed": score(composed(logits)),
+                "refined decoded": score(logits > 0),
+            }
+
+        def bounds(F, M):
+            return {"F": score(F), "oracle": score(compose(F, M, seen.surface))}
+
         F, M = seen.points
         code = encode(prior, Grids(F, M))
         first = decode(prior, code)
         logits = search(prior, code, BALANCED.target(Grids(F, M), first))
-        by_points = {
-            "F": score(F),
-            "oracle": score(compose(F, M, seen.surface)),
-            "first composed": score(compose(F, M, first > 0)),
-            "first decoded": score(first > 0),
-            "refined composed": score(compose(F, M, logits > 0)),
-            "refined decoded": score(logits > 0),
-        }
+        by_points = bounds(F, M) | judged(first, logits, lambda x: compose(F, M, x > 0))
 
-        found = seen.evidence
-        soft = evidence.as_grids(found)
-        F, M, _ = binary(soft)
+        soft = evidence.as_grids(seen.evidence)
+        near, hidden, _ = binary(soft)
+        composed = lambda x: compose(soft.occupied, soft.occluded, jax.nn.sigmoid(x))  # noqa: E731
         code = encode(prior, soft)
         first = decode(prior, code)
         logits = search(prior, code, SOFT.target(soft, first))
+        by_distances = bounds(near, hidden) | judged(first, logits, composed)
+        by_distances["refined, F and M"] = score(compose(near, hidden, logits > 0))
 
-        def composed(logits):
-            return compose(soft.occupied, soft.occluded, jax.nn.sigmoid(logits))
-
-        by_distances = {
-            "F": score(F),
-            "oracle": score(compose(F, M, seen.surface)),
-            "first composed": score(composed(first)),
-            "first decoded": score(first > 0),
-            "refined composed": score(composed(logits)),
-            "refined decoded": score(logits > 0),
-            "refined, F and M": score(compose(F, M, logits > 0)),
-        }
-
-        other = mirrored(found)
+        other = mirrored(seen.evidence)
         first, logits = (symmetrised(x, other) for x in (first, logits))
-        by_mirror = {
-            "first composed": score(composed(first)),
-            "first decoded": score(first > 0),
-            "refined composed": score(composed(logits)),
-            "refined decoded": score(logits > 0),
+        by_mirror = judged(first, logits, composed) | {
             "agreement": other.agreement,
             "symmetric": other.symmetric.astype(jnp.float32),
         }
@@ -217,54 +189,15 @@ def rounded(values: np.ndarray) -> list[float]:
     return [round(float(x), 4) for x in values]
 
 
-# ------------------------------------------------------------------ evaluation
-
-
 def means(journal: Journal) -> dict[str, dict[str, list[float]]]:
     """Means over chairs: `means[way][score]`, one for each number of frames."""
-    first = next(iter(journal.rows.values()))
+    rows = list(journal.rows.values())
     return {
         way: {
-            score: rounded(np.mean([row[way][score] for row in journal.rows.values()], axis=0))
-            for score in scores
+            score: rounded(np.mean([row[way][score] for row in rows], axis=0)) for score in scores
         }
-        for way, scores in first.items()
+        for way, scores in rows[0].items()
     }
-
-
-def table(journal: Journal, config: Config) -> str:
-    """The means as text."""
-    lines = [f"{len(journal.rows)} chairs".ljust(32) + "".join(f"{k:>8}" for k in config.frames)]
-    for way, scores in means(journal).items():
-        lines += [
-            f"{way}, {score}".ljust(32) + "".join(f"{x:8.3f}" for x in values)
-            for score, values in scores.items()
-        ]
-    return "\n".join(lines)
-
-
-def claims(journal: Journal, config: Config) -> list[Claim]:
-    """Distances measure better than points, and never worse for more frames."""
-    found = means(journal)
-    ways = [found[way] for way in ("points", "distances")]
-
-    def tell(score: str) -> str:
-        values = (", ".join(f"{x:.3f}" for x in way[score]) for way in ways)
-        return f"{score} {' -> '.join(values)}"
-
-    compared = ("F", "oracle", "refined composed", "refined decoded")
-    better = [np.greater(ways[1][s], ways[0][s]).all() for s in compared]
-    rises = bool(np.all(np.diff(ways[1]["F"]) >= 0))
-    frames = ", ".join(map(str, config.frames))
-    return [
-        Claim(
-            "Eq. 6",
-            "Under a sensor's noise, distances measure more than points, the more so the more "
-            "frames there are",
-            f"Points -> distances after {frames} frames: " + "; ".join(map(tell, compared)),
-            "yes" if all(better) and rises else "partly" if any(better) else "no",
-        )
-    ]
 
 
 if __name__ == "__main__":
