@@ -14,8 +14,7 @@ Time: 4 minutes on two cores.
 """
 
 import importlib.util
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,10 +27,11 @@ import tyro
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+import runs
+from filming import from_orbit
 from jaxshape.data import render
-from jaxshape.data.capture import Capture, camera_distance, capture, fuse_frames
-from jaxshape.data.dataset import Object, hash_seed, load_object
-from jaxshape.data.meshes import Model
+from jaxshape.data.capture import Capture, fuse_frames
+from jaxshape.data.dataset import Object
 from jaxshape.data.virtual_cameras import CAMERAS
 from jaxshape.geometry import camera, evidence
 from jaxshape.geometry.distance import fine_frame
@@ -43,16 +43,15 @@ from jaxshape.results.journal import Journal
 from jaxshape.results.output import SMOOTHING
 from jaxshape.results.surface import surface
 from jaxshape.search.composition import compose
-from study import Claim, conclude, listed
+from study import listed
 
-RESULTS = Path(__file__).parent / "results"
 DEVICE = CAMERAS["kinect"]
 SAMPLES, POINTS = 200_000, 15_000
 """Number of points that represent a surface, and of points whose distance to it is measured."""
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
     """Settings of the experiment."""
 
     meshes: Path | None = None
@@ -63,16 +62,11 @@ class Config:
     """Numbers of frames that are fused."""
     weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Two procedural chairs, as a test."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        config = replace(config, meshes=None, every=39, frames=(2, 4))
-    journal = run(config)
-    for k, ways in means(journal).items():
+    journal = run(config.reduced(meshes=None, every=39, frames=(2, 4)))
+    for k, ways in means(journal.rows)["means"].items():
         for way, values in ways.items():
             print(f"{k:>3} frames  {way:<24}" + "".join(f"{x:8.2f}" for x in values))
 
@@ -80,31 +74,23 @@ def main(config: Config) -> None:
 def run(config: Config) -> Journal:
     """Measure the meshes of every chair, and write the results."""
     prior = load_prior(config.weights)
-    settings = {
-        "set": "procedural" if config.meshes is None else "CAD",
-        "every": config.every,
-        "frames": config.frames,
-        "weights": fingerprint(prior),
-        "open3d": importlib.util.find_spec("open3d") is not None,
-    }
-    journal = Journal(config.results / "surface_accuracy.json", settings)
-    for chair in listed(config.meshes, 78)[:: config.every]:
-        name = chair.name
-        if name not in journal.rows:
-            began = time.perf_counter()
-            journal.add({name: row(chair, prior, config)}, time.perf_counter() - began)
-    conclude(journal, claims(journal), means=means(journal))
+    journal = config.journal(
+        "surface_accuracy",
+        set="procedural" if config.meshes is None else "CAD",
+        every=config.every,
+        frames=config.frames,
+        weights=fingerprint(prior),
+        open3d=importlib.util.find_spec("open3d") is not None,
+    )
+    chairs = listed(config.meshes, 78)[:: config.every]
+    runs.complete(journal, {one.name: partial(row, one, prior, config) for one in chairs}, means)
     return journal
 
 
 def row(chair: Object, prior: ShapePrior, config: Config) -> dict[str, Any]:
     """Mean and 90th percentile, in millimetres, of every mesh after every number of frames."""
-    model = load_object(chair)
-    assert isinstance(model, Model), model
-    T = camera.orbit(max(config.frames), camera_distance(model.mesh, DEVICE))
-    seed = hash_seed(0, *model.name.encode())
-    captured = capture(model.mesh, T, noise=True, seed=seed, camera=DEVICE)
-    return {str(k): _after(k, model.mesh, captured, prior) for k in config.frames}
+    truth, captured = from_orbit(chair, max(config.frames), DEVICE)
+    return {str(k): _after(k, truth, captured, prior) for k in config.frames}
 
 
 def _after(k: int, truth: trimesh.Trimesh, captured: Capture, prior: ShapePrior) -> dict[str, Any]:
@@ -203,41 +189,17 @@ def open3d_mesh(captured: Capture) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), process=False)
 
 
-# ------------------------------------------------------------------ evaluation
-
-
-def means(journal: Journal) -> dict[str, dict[str, list[float]]]:
+def means(rows: dict[str, Any]) -> dict[str, Any]:
     """Means over chairs: `means[frames][way]`, mean and 90th percentile in millimetres."""
-    rows = list(journal.rows.values())
-    return {
+    each = list(rows.values())
+    found = {
         k: {
-            way: [round(float(x), 2) for x in np.mean([row[k][way] for row in rows], axis=0)]
+            way: [round(float(x), 2) for x in np.mean([row[k][way] for row in each], axis=0)]
             for way in ways
         }
-        for k, ways in rows[0].items()
+        for k, ways in each[0].items()
     }
-
-
-def claims(journal: Journal) -> list[Claim]:
-    """The claim that the fused surface is nearer to the truth than those of voxels and Open3D."""
-    found = means(journal)
-    ours = {k: ways["measured to CAD"][0] for k, ways in found.items()}
-    others = {
-        name: {k: ways[name][0] for k, ways in found.items()}
-        for name in ("voxels to CAD", "Open3D to CAD")
-        if name in next(iter(found.values()))
-    }
-    others_in_words = [f"{name} {', '.join(map(str, x.values()))} mm" for name, x in others.items()]
-    better = [all(ours[k] <= 1.1 * x[k] for k in ours) for x in others.values()]
-    return [
-        Claim(
-            "Fig. real_cma_au",
-            "The measured surface is as exact as the sensor allows",
-            f"Measured to CAD {', '.join(map(str, ours.values()))} mm after "
-            f"{', '.join(ours)} frames; " + "; ".join(others_in_words),
-            "yes" if all(better) else "partly" if any(better) else "no",
-        )
-    ]
+    return {"means": found}
 
 
 if __name__ == "__main__":
