@@ -25,7 +25,7 @@ demo: $(VENV)/.runtime
 # Every figure of the paper, and the README's table: about two hours on two cores. Killed, it goes on
 # where it stopped. The 78 CAD seats come from a Debian and an
 # npm package (npm and dpkg-deb are needed); without a recording in KITCHEN, real_chair.py is left out.
-PAPER := convergence step_size iou_by_frames voluminous gallery gradient_failures equal_budget objective
+PAPER := convergence step_size iou_by_frames gallery gradient_failures equal_budget objective
 KITCHEN ?= kitchen/frames
 
 paper: export OPENBLAS_NUM_THREADS = 1
@@ -35,7 +35,6 @@ paper: $(VENV)/.runtime cad_chairs
 		$(BIN)/python experiments/$$script.py --test.meshes cad_chairs || exit 1; \
 	done
 	test ! -d $(KITCHEN) || $(BIN)/python experiments/real_chair.py --recording $(KITCHEN)
-	$(BIN)/python experiments/paper_table.py
 
 cad_chairs: $(VENV)/.runtime
 	mkdir -p packages

@@ -26,7 +26,6 @@ import study
 from figures import LINES, PAGE, draw_mean, save_column
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
-from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.report.figures import tidy
 from jaxshape.report.palette import PINK, RED
 from jaxshape.results.evaluation import Case
@@ -35,19 +34,19 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 from study import (
     TUNED,
-    Claim,
     Contestant,
     Scores,
     TestSet,
     column,
     compare,
-    conclude,
     groups,
-    mean_interval,
     mean_low_high,
+    rounded,
 )
 
-CHAIRS_AT_A_TIME = 8
+AT_A_TIME = 8
+OFTEN, SELDOM = 30, 12
+"""Numbers of iterations at which objective and IoU are reported."""
 PAPER_CMA, PAPER_DESCENT = "CMA-ES, sigma0 2 in codes", "descent, step 0.14 in codes"
 
 SEARCHES: dict[str, tuple[str, RefineConfig]] = TUNED | {
@@ -81,27 +80,18 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Follow every search on every chair, and write the results."""
-    prior = load_prior(config.weights)
-    settings = {
-        "frames": config.frames,
-        "searches": {
-            name: [method, repr(replace(how, objective="balanced"))]
-            for name, (method, how) in SEARCHES.items()
-        },
-        "iterations": [sampled(config, 30), sampled(config, 12)],
-        "weights": fingerprint(prior),
+    searches = {
+        name: [method, repr(replace(how, objective="balanced"))]
+        for name, (method, how) in SEARCHES.items()
     }
-    journal = Journal(config.results / "convergence.json", settings)
-    contestants = {name: along(*search, prior, config) for name, search in SEARCHES.items()}
-    compare(
-        contestants,
-        prior,
-        config.test,
-        (config.frames,),
-        journal,
-        at_a_time=CHAIRS_AT_A_TIME,
+    iterations = [sampled(config, OFTEN), sampled(config, SELDOM)]
+    prior, journal = config.begin(
+        "convergence", frames=config.frames, searches=searches, iterations=iterations
     )
-    conclude(journal, claims(journal, config), summary=summary(journal, config))
+    contestants = {name: along(*search, prior, config) for name, search in SEARCHES.items()}
+    compare(contestants, prior, config.test, (config.frames,), journal, at_a_time=AT_A_TIME)
+    found = {group or "all": summary(journal, group, config) for group in (*groups(journal), None)}
+    journal.write({"summary": found})
     return journal
 
 
@@ -115,7 +105,7 @@ def along(method: str, how: RefineConfig, prior: ShapePrior, config: Config) -> 
     """The contestant that reports its whole search, at some iterations."""
     how = replace(how, iterations=config.iterations, tolerance=0.0)
     refiner = refiner_for(method, prior, how)
-    often, seldom = (jnp.array(sampled(config, n)) - 1 for n in (30, 12))
+    often, seldom = (jnp.array(sampled(config, n)) - 1 for n in (OFTEN, SELDOM))
 
     def contest(keys: Array, prior: ShapePrior, case: Case) -> Scores:
         F, M = case.grids.occupied, case.grids.occluded
@@ -164,119 +154,64 @@ def fluctuation(
     }
 
 
-def summary(journal: Journal, config: Config) -> dict[str, Any]:
-    """Means and intervals over chairs at the start, early, and at the end."""
-    early = sampled(config, 30).index(config.early)
+def summary(journal: Journal, group: str | None, config: Config) -> dict[str, Any]:
+    """Means and intervals of each search over the chairs of a group, or of all groups.
 
-    def of(group: str, name: str) -> dict[str, Any]:
-        def scores(score: str) -> np.ndarray:
-            return column(journal, group, config.frames, name, score)
-
-        numbers = {
-            "objective_start": scores("start"),
-            "objective_early": scores("best")[:, early],
-            "objective": scores("best")[:, -1],
-            "iou_start": scores("start_iou"),
-            "iou_early": scores("iou")[:, sampled(config, 12).index(config.early)],
-            "iou": scores("iou")[:, -1],
-            "rises": scores("rises"),
-            "uphill": scores("uphill"),
-            "iterations": scores("iterations"),
-        }
-        return {key: mean_low_high(values) for key, values in numbers.items()}
-
-    return {group: {name: of(group, name) for name in SEARCHES} for group in groups(journal)}
-
-
-def claims(journal: Journal, config: Config) -> list[Claim]:
-    """The paper's claims about this figure, and our findings over the chairs of all groups."""
-    early = sampled(config, 30).index(config.early)
-    early_iou = sampled(config, 12).index(config.early)
+    `fall` is the decrease of the objective as a share of the best search's decrease; `early_fall`
+    and `early_gain` are the shares of a search's own decrease and gain in IoU that it reaches
+    early. Leads are those of CMA-ES over the search. `waited` is the median number of iterations
+    until something better than the start is found.
+    """
+    often = sampled(config, OFTEN)
+    early = often.index(config.early)
+    early_iou = sampled(config, SELDOM).index(config.early)
 
     def scores(name: str, score: str) -> np.ndarray:
-        return column(journal, None, config.frames, name, score)
+        return column(journal, group, config.frames, name, score)
 
-    def last(name: str, score: str) -> np.ndarray:
-        return scores(name, score)[:, -1]
+    def fall(name: str) -> np.ndarray:
+        return scores(name, "start").mean() - scores(name, "best").mean(axis=0)
 
-    def lower(name: str) -> np.ndarray:
-        """Final objective of another search minus that of CMA-ES."""
-        return last(name, "best") - last("CMA-ES", "best")
+    def rise(name: str) -> np.ndarray:
+        return scores(name, "iou").mean(axis=0) - scores(name, "start_iou").mean()
 
-    def higher(name: str) -> np.ndarray:
-        return last("CMA-ES", "iou") - last(name, "iou")
+    lowest, shape = (scores("CMA-ES", score)[:, -1] for score in ("best", "iou"))
+    most = max(fall(name)[-1] for name in SEARCHES)
 
-    def fall(name: str, at: int = -1) -> float:
-        """Decrease as a share of the largest decrease of all searches."""
-        start = scores(name, "start").mean()
-        lowest = min(last(other, "best").mean() for other in SEARCHES)
-        return float((start - scores(name, "best")[:, at].mean()) / (start - lowest))
+    def of(name: str) -> dict[str, Any]:
+        best, shapes = scores(name, "best"), scores(name, "iou")
+        numbers = {
+            "objective_start": scores(name, "start"),
+            "objective_early": best[:, early],
+            "objective": best[:, -1],
+            "iou_start": scores(name, "start_iou"),
+            "iou_early": shapes[:, early_iou],
+            "iou": shapes[:, -1],
+            "rises": scores(name, "rises"),
+            "uphill": scores(name, "uphill"),
+            "iterations": scores(name, "iterations"),
+            "iou_lead": shape - shapes[:, -1],
+        }
+        stuck = (best >= scores(name, "start")[:, None]).sum(axis=1)
+        return {key: mean_low_high(values) for key, values in numbers.items()} | {
+            "fall": share(fall(name)[-1], most),
+            "early_fall": share(fall(name)[early], fall(name)[-1]),
+            "early_gain": share(rise(name)[early_iou], rise(name)[-1]),
+            "objective_lead_on": int((best[:, -1] > lowest).sum()),
+            "waited": [0, *often][int(np.median(stuck))],
+        }
 
-    def part(name: str) -> str:
-        """Shares of the decrease and of the gain in IoU that a search reaches early."""
-        start, best = scores(name, "start").mean(), scores(name, "best").mean(axis=0)
-        first, found = scores(name, "start_iou").mean(), scores(name, "iou").mean(axis=0)
-        ways = (
-            (start - best[early]) / (start - best[-1]),
-            (found[early_iou] - first) / (found[-1] - first),
-        )
-        return f"{name} {ways[0]:.0%} and {ways[1]:.0%}"
+    return {name: of(name) for name in SEARCHES}
 
-    def rises(name: str) -> float:
-        return float(scores(name, "rises").mean())
 
-    stuck = (scores(PAPER_CMA, "best") >= scores(PAPER_CMA, "start")[:, None]).sum(axis=1)
-    waited = [0, *sampled(config, 30)][int(np.median(stuck))]
-    count, end = len(lower("Adam")), config.iterations
-    wins = {name: int((lower(name) > 0).sum()) for name in ("gradient descent", "Adam")}
-    return [
-        Claim(
-            "Fig. gm left",
-            "Gradient descent converges smoothly; CMA-ES declines in a fluctuating fashion",
-            f"The loss rises in {rises('CMA-ES'):.0%} of the iterations of CMA-ES, in"
-            f" {rises('gradient descent'):.0%} of the iterations of descent",
-            "yes" if rises("gradient descent") < 0.1 < rises("CMA-ES") else "no",
-        ),
-        Claim(
-            "Fig. gm left",
-            "CMA-ES is much better at overcoming local minima",
-            f"After {end} iterations its objective is lower than that of descent on"
-            f" {wins['gradient descent']} of {count} chairs, and lower than that of Adam on"
-            f" {wins['Adam']};"
-            f" IoU {mean_interval(higher('gradient descent'))} over descent,"
-            f" {mean_interval(higher('Adam'))} over Adam",
-            {(True, True): "yes", (True, False): "better than descent, not better than Adam"}.get(
-                (lower("gradient descent").mean() > 0, lower("Adam").mean() > 0), "no"
-            ),
-        ),
-        Claim(
-            "Sec. 4",
-            "Steps of 0.14 converge fast without overshooting",
-            f"With a step of 0.14, descent achieves {fall(PAPER_DESCENT):.0%} of the best search's"
-            f" decrease in {end} iterations, with our step {fall('gradient descent'):.0%}",
-            "yes" if fall(PAPER_DESCENT) > 0.9 * fall("gradient descent") else "no",
-        ),
-        Claim(
-            "Sec. 4",
-            "sigma0 = 2 is best for CMA-ES",
-            f"With sigma0 = 2, CMA-ES finds nothing better than the start for {waited} iterations"
-            f" (median), and {fall(PAPER_CMA):.0%} of the best search's decrease in {end}; with the"
-            f" sigma0 chosen here, {fall('CMA-ES'):.0%}",
-            "yes" if fall(PAPER_CMA) >= fall("CMA-ES") else "no",
-        ),
-        Claim(
-            "beyond",
-            f"{config.early} iterations suffice instead of {end}",
-            "Share of the objective's decrease and of the gain in IoU that is reached by then: "
-            + ", ".join(part(name) for name in ("CMA-ES", "gradient descent", "Adam")),
-            "for Adam only" if fall("Adam", early) > 0.9 else "no",
-        ),
-    ]
+def share(part: float, whole: float) -> float:
+    """0 where nothing was reached."""
+    return rounded(part / whole) if whole else 0.0
 
 
 def plot(journal: Journal, config: Config) -> None:
     """A column of panels for each group: the objective above, IoU below."""
-    often, seldom = sampled(config, 30), sampled(config, 12)
+    often, seldom = sampled(config, OFTEN), sampled(config, SELDOM)
 
     def draw(figure: Any) -> None:
         found = groups(journal)

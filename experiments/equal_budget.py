@@ -15,7 +15,7 @@ Results: experiments/results/equal_budget.json, .png and .svg; finished chairs a
 Time: 16 minutes on two cores.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -26,10 +26,9 @@ from jaxtyping import Array, Float, Int
 from scipy.stats import spearmanr
 
 import study
-from figures import LINES, PAGE, interval, save_column
+from figures import LINES, PAGE, save_column
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
-from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.report.figures import tidy
 from jaxshape.report.palette import BLUE, GREY, INK, PINK, RED, SKY
 from jaxshape.results.journal import Journal
@@ -40,14 +39,13 @@ from jaxshape.search.reconstruction import reconstruct
 from jaxshape.search.refiner import Refiner, StopReason
 from study import (
     TUNED,
-    Claim,
     Contestant,
     TestSet,
     column,
     compare,
-    conclude,
     groups,
-    mean_interval,
+    mean_low_high,
+    rounded,
 )
 
 GRADIENT = 3
@@ -65,7 +63,7 @@ DRAWN: dict[str, dict[str, Any]] = {
     "Adam": LINES["Adam"],
     "L-BFGS": {"color": INK, "dashes": (3, 1)},
 }
-GRADIENTS = ("gradient descent", "Adam", "L-BFGS")
+Curve = Float[np.ndarray, "chair budget"]
 
 
 @dataclass(frozen=True)
@@ -89,21 +87,16 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Give every search its budget on every chair, and write the results."""
-    prior = load_prior(config.weights)
-    settings = {
-        "frames": config.frames,
-        "budgets": config.budgets,
-        "gradient": GRADIENT,
-        "weights": fingerprint(prior),
-    }
-    journal = Journal(config.results / "equal_budget.json", settings)
+    prior, journal = config.begin(
+        "equal_budget", frames=config.frames, budgets=config.budgets, gradient=GRADIENT
+    )
     contestants = {
         name: contestant(search, config.budgets)
         for name, search in searches(prior, config.budgets[-1]).items()
         if name in config.searches
     }
     compare(contestants, prior, config.test, (config.frames,), journal, at_a_time=8)
-    conclude(journal, claims(journal, config), summary=summary(journal, config))
+    journal.write({"summary": summary(journal, config)})
     return journal
 
 
@@ -214,187 +207,87 @@ def _after(
 # ------------------------------------------------------------------ evaluation of the rows
 
 
-def curve(journal: Journal, config: Config, group: str | None, name: str, score: str) -> np.ndarray:
-    """A score of a search for each chair: first of the encoder, then within each budget."""
-    return column(journal, group, config.frames, name, score)
+def curves(journal: Journal, config: Config, group: str | None, score: str) -> dict[str, Curve]:
+    """A score of every search: first of the encoder, then within each budget."""
+    return {name: column(journal, group, config.frames, name, score) for name in config.searches}
 
 
-def seconds_per_call(journal: Journal, config: Config, name: str) -> float:
-    """The median over chairs of the seconds of one decoder call."""
-    rows = [row[str(config.frames)][name] for row in journal.rows.values()]
-    return float(np.median([row["seconds"] / max(row["calls"], 1) for row in rows]))
+def seconds_per_call(journal: Journal, config: Config) -> dict[str, float]:
+    """The median over chairs of the seconds of one decoder call, for every search."""
+    rows = [row[str(config.frames)] for row in journal.rows.values()]
+    return {
+        name: float(np.median([row[name]["seconds"] / max(row[name]["calls"], 1) for row in rows]))
+        for name in config.searches
+    }
 
 
-def shared_seconds(journal: Journal, config: Config) -> float:
-    """The time that the fastest search needs for its whole budget."""
-    return config.budgets[-1] * min(
-        seconds_per_call(journal, config, name) for name in config.searches
-    )
-
-
-def at_time(
-    journal: Journal, config: Config, group: str | None, name: str, score: str, seconds: float
-) -> np.ndarray:
-    """A score by chair after some seconds, interpolated between budgets."""
-    calls = seconds / seconds_per_call(journal, config, name)
-    curves = curve(journal, config, group, name, score)
-    return np.array([np.interp(calls, (0, *config.budgets), values) for values in curves])
-
-
-def agreement(
-    journal: Journal, config: Config, group: str | None, *, finished: bool = False
-) -> np.ndarray:
+def agreement(objective: dict[str, Curve], shape: dict[str, Curve], finished: bool) -> np.ndarray:
     """Rank correlation by chair between a low objective and a high IoU.
 
     It is taken over all searches and budgets, with equal codes counted once, or, with `finished`,
     over the searches at the whole budget. A chair with fewer than three codes to rank is left out.
     """
-    found = np.stack(
-        [
-            np.stack([curve(journal, config, group, name, s) for name in config.searches], axis=1)
-            for s in ("objective", "iou")
-        ],
-        axis=-1,
-    )  # chair, search, budget, score
+    found = np.stack([np.stack([*one.values()], axis=1) for one in (objective, shape)], axis=-1)
     pairs = found[:, :, -1] if finished else found.reshape(len(found), -1, 2)
     distinct = [np.unique(chair, axis=0) for chair in pairs]
     ranked = [spearmanr(-x[:, 0], x[:, 1])[0] for x in distinct if len(x) > 2]
     return np.nan_to_num(np.array(ranked))
 
 
-def last_half(
-    journal: Journal, config: Config, group: str | None, name: str, score: str
-) -> np.ndarray:
-    """The change in the second half of the budget, by chair."""
-    middle = 1 + int(np.searchsorted(config.budgets, config.budgets[-1] / 2))
-    values = curve(journal, config, group, name, score)
-    return values[:, -1] - values[:, middle]
-
-
 def summary(journal: Journal, config: Config) -> dict[str, Any]:
-    """Means over chairs: `summary[group]["calls"][score][search]`, a number for each budget."""
-    whole = shared_seconds(journal, config)
-    times = [whole / 8, whole / 4, whole / 2, whole]
+    """Figures of each search, over the chairs of each group and of all groups.
 
-    def rounded(values: Any) -> list[float]:
-        return [round(float(x), 4) for x in np.atleast_1d(values)]
+    Means are given within each budget, and after shares of the time in which the fastest search
+    spends its whole budget, interpolated between budgets. Leads are those over CMA-ES at the end.
+    """
+    budgets, half = (0, *config.budgets), np.searchsorted(config.budgets, config.budgets[-1] / 2)
+    per_call = seconds_per_call(journal, config)
+    times = config.budgets[-1] * min(per_call.values()) / np.array([8, 4, 2, 1])
 
-    def table(values: Callable[[str, str], Any]) -> dict[str, Any]:
-        return {
-            s: {name: values(name, s) for name in config.searches} for s in ("iou", "objective")
+    def after_time(name: str, curve: Curve) -> Curve:
+        return np.array([np.interp(times / per_call[name], budgets, values) for values in curve])
+
+    def of(group: str | None) -> dict[str, Any]:
+        found = {score: curves(journal, config, group, score) for score in ("iou", "objective")}
+        timed = {
+            score: {name: after_time(name, curve) for name, curve in by_name.items()}
+            for score, by_name in found.items()
         }
-
-    def of(group: str) -> dict[str, Any]:
+        shape = found["iou"]
+        ended = column(journal, group, config.frames, "CMA-ES", "ended")
         return {
-            "calls": table(
-                lambda name, s: rounded(curve(journal, config, group, name, s).mean(axis=0))
-            ),
-            "seconds": table(
-                lambda name, s: rounded(
-                    [at_time(journal, config, group, name, s, t).mean() for t in times]
-                )
-            ),
-            "second half": table(
-                lambda name, s: mean_interval(last_half(journal, config, group, name, s))
-            ),
-            "rank correlation": rounded(agreement(journal, config, group)),
+            "calls": by_search(found, lambda x: rounded(x.mean(axis=0))),
+            "seconds": by_search(timed, lambda x: rounded(x.mean(axis=0))),
+            "second half": by_search(found, lambda x: mean_low_high(x[:, -1] - x[:, 1 + half])),
+            "falls in the second half": {
+                name: int((x[:, -1] < x[:, 1 + half]).sum()) for name, x in shape.items()
+            },
+            "lead": {
+                name: {
+                    "calls": mean_low_high(x[:, -1] - shape["CMA-ES"][:, -1]),
+                    "seconds": mean_low_high((timed["iou"][name] - timed["iou"]["CMA-ES"])[:, -1]),
+                }
+                for name, x in shape.items()
+            },
+            "rank correlation": {
+                "all": mean_low_high(agreement(found["objective"], shape, finished=False)),
+                "finished": mean_low_high(agreement(found["objective"], shape, finished=True)),
+            },
+            "CMA-ES stops by itself": int(ended.sum()),
         }
 
     return {
-        "calls": [0, *config.budgets],
+        "calls": budgets,
         "seconds": rounded(times),
-        "milliseconds per call": {
-            name: round(1000 * seconds_per_call(journal, config, name), 3)
-            for name in config.searches
-        },
-    } | {group: of(group) for group in groups(journal)}
+        "milliseconds per call": {name: rounded(1000 * s) for name, s in per_call.items()},
+    } | {group or "all": of(group) for group in (*groups(journal), None)}
 
 
-def claims(journal: Journal, config: Config) -> list[Claim]:
-    """Claims of the paper, and further ones, over the chairs of all groups."""
-    budget, whole = config.budgets[-1], shared_seconds(journal, config)
-
-    def at_calls(name: str, score: str = "iou") -> np.ndarray:
-        return curve(journal, config, None, name, score)[:, -1]
-
-    def in_seconds(name: str) -> np.ndarray:
-        return at_time(journal, config, None, name, "iou", whole)
-
-    def ahead(rival: str) -> np.ndarray:
-        return at_calls("CMA-ES") - at_calls(rival)
-
-    def over(rivals: Sequence[str]) -> str:
-        return ", ".join(f"{mean_interval(ahead(name))} over {name}" for name in rivals)
-
-    def holds(rivals: Sequence[str]) -> str:
-        beaten = [name for name in rivals if ahead(name).mean() > 0]
-        some = f"than {' and '.join(beaten)}" if beaten else "no"
-        return "yes" if beaten == [*rivals] else some
-
-    gradients, populations = (
-        [name for name in names if name in config.searches]
-        for names in (GRADIENTS, ("CMA-ES, 64", "CMA-ES, 256"))
-    )
-    ended = column(journal, None, config.frames, "CMA-ES", "ended")
-    lowest = min(config.searches, key=lambda name: at_calls(name, "objective").mean())
-    objective, gain = (
-        last_half(journal, config, None, lowest, score) for score in ("objective", "iou")
-    )
-    every, final = (agreement(journal, config, None, finished=end) for end in (False, True))
-    return [
-        Claim(
-            "Sec. 3.3",
-            "CMA-ES finds better shapes than gradient descent",
-            f"IoU of CMA-ES at {budget} decoder calls " + over(gradients),
-            holds(gradients),
-        ),
-        _ranked(config.searches, f"Which search is best after {budget} decoder calls?", at_calls),
-        _ranked(config.searches, f"Which search is best after {whole:.1f} s a chair?", in_seconds),
-        Claim(
-            "beyond",
-            "Populations of 17 are better than larger populations in fewer iterations",
-            f"IoU {over(populations)}",
-            holds(populations),
-        ),
-        Claim(
-            "beyond",
-            "Restarts help",
-            f"CMA-ES stops by itself within {budget} calls on {ended.sum()} of {len(ended)} chairs",
-            "no search to restart"
-            if not ended.any()
-            else "yes"
-            if ahead("IPOP").mean() < 0
-            else "no",
-        ),
-        Claim(
-            "beyond",
-            "A lower objective is a better shape",
-            f"Rank correlation by chair {mean_interval(every)} over all searches and budgets,"
-            f" {mean_interval(final)} among finished searches",
-            "along a search"
-            if every.mean() > 0.5 > final.mean()
-            else "yes"
-            if final.mean() > 0.5
-            else "no",
-        ),
-        Claim(
-            "beyond",
-            "IoU still rises in the second half of the best search",
-            f"Change in the second half of {lowest}: objective {objective.mean():+.4f}, IoU"
-            f" {mean_interval(gain)}; IoU falls on {(gain < 0).sum()} of {len(gain)} chairs",
-            "yes" if interval(gain)[0] > 0 else "no",
-        ),
-    ]
-
-
-def _ranked(searched: Sequence[str], question: str, scores: Callable[[str], np.ndarray]) -> Claim:
-    """The searches by their mean IoU."""
-    ranked = sorted(searched, key=lambda name: -scores(name).mean())
-    order = ", ".join(f"{name} {scores(name).mean():.3f}" for name in ranked)
-    lead = mean_interval(scores(ranked[0]) - scores("CMA-ES"))
-    return Claim(
-        "beyond", question, f"IoU: {order}. Lead of the first over CMA-ES: {lead}", ranked[0]
-    )
+def by_search(found: dict[str, dict[str, Curve]], figure: Callable[[Curve], Any]) -> dict[str, Any]:
+    return {
+        score: {name: figure(curve) for name, curve in by_name.items()}
+        for score, by_name in found.items()
+    }
 
 
 # ------------------------------------------------------------------ figure
@@ -403,28 +296,27 @@ def _ranked(searched: Sequence[str], question: str, scores: Callable[[str], np.n
 def plot(journal: Journal, config: Config) -> None:
     """IoU and objective by decoder calls, and one against the other; a row for each group."""
 
-    def means(group: str, name: str, score: str) -> np.ndarray:
-        return curve(journal, config, group, name, score).mean(axis=0)
-
     def draw(figure: Any) -> None:
         found = groups(journal)
         for row, group in zip(figure.subplots(len(found), 3, squeeze=False), found, strict=True):
+            shapes, objectives = (
+                curves(journal, config, group, score) for score in ("iou", "objective")
+            )
             for name in config.searches:
                 line = DRAWN[name]
-                shape, objective = (means(group, name, score) for score in ("iou", "objective"))
+                shape, objective = (x[name].mean(axis=0) for x in (shapes, objectives))
                 row[0].plot(config.budgets, shape[1:], label=name, **line)
                 row[1].plot(config.budgets, objective[1:], **line)
                 row[2].plot(objective, shape, marker=".", markersize=4, linewidth=0.8, **line)
-            for axes, score in zip(row, ("iou", "objective"), strict=False):
-                axes.axhline(means(group, "CMA-ES", score)[0], color=GREY, linewidth=0.8)
+            for axes, first in zip(row, (shapes, objectives), strict=False):
+                axes.axhline(first["CMA-ES"][:, 0].mean(), color=GREY, linewidth=0.8)
                 axes.set(xscale="log", xlabel="decoder calls")
                 ticks = [
                     k for k in config.budgets if config.budgets[-1] in (k, 4 * k, 16 * k, 64 * k)
                 ]
                 axes.set_xticks(ticks, [str(k) for k in ticks])
                 axes.minorticks_off()
-            count = len(curve(journal, config, group, "CMA-ES", "iou"))
-            row[0].set(title=f"{count} {group} chairs", ylabel="IoU")
+            row[0].set(title=f"{len(shapes['CMA-ES'])} {group} chairs", ylabel="IoU")
             row[1].set(ylabel="objective")
             row[2].set(xlabel="objective", ylabel="IoU")
             row[2].invert_xaxis()

@@ -3,9 +3,8 @@ r"""Where gradients stall and CMA-ES goes on, and the opposite cases (paper, Fig
     python experiments/gradient_failures.py --test.meshes cad_chairs/
 
 For 1, 4 and 8 frames, the script takes the chair on which CMA-ES leads plain descent most, by IoU,
-and the chair on which it trails most (`--examples` for more). It chooses among all chairs if
-iou_by_frames.py has left its results in the same folder, otherwise among 32 chairs that it searches
-briefly itself. Plain descent, Adam and CMA-ES then search the chosen chairs for the paper's 350
+and the chair on which it trails most, among all rows of iou_by_frames.py, which runs first if it
+has not been run. Plain descent, Adam and CMA-ES then search the chosen chairs for the paper's 350
 iterations, and each search continues for as long from the end of every other one. This tells a
 local minimum from a slow search: only a search that can leave a minimum moves away from it. The
 objective is also followed along the straight line between two ends: if it never rises above both,
@@ -16,10 +15,9 @@ frequency.
 
 Results: experiments/results/gradient_failures.json, and .png and .svg of the chairs on which CMA-ES
 leads; gradient_failures_opposite has the chairs on which it trails. Finished chairs are kept.
-Time: 6 minutes on two cores after iou_by_frames.py, 8 without.
+Time: 6 minutes on two cores after iou_by_frames.py.
 """
 
-import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,34 +27,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 from rich.progress import track
 
-import study
+import iou_by_frames
 from figures import PAGE, save_column
-from jaxshape.data.dataset import load_object
-from jaxshape.data.meshes import Skipped
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode
-from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.model.weights import load_prior
 from jaxshape.report.panels import grid_panel, measurement_panel
-from jaxshape.results.evaluation import Case, case_keys, fill, observe
+from jaxshape.results.evaluation import Case, fill
 from jaxshape.results.journal import Journal
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 from jaxshape.search.residuals import LESS_FREE, cross_entropy, weigh
-from study import (
-    SEEN,
-    TUNED,
-    Claim,
-    Subject,
-    TestSet,
-    compare,
-    conclude,
-    subjects,
-    tuned,
-)
+from study import SEEN, TUNED, Subject, observed, subjects, together
 
+FRAMES = (1, 4, 8)
 SHAPES = ("encoder", *TUNED)
 LEADS, TRAILS = "CMA-ES leads", "CMA-ES trails"
 POINTS = 21
@@ -68,42 +55,32 @@ Rows = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Config(study.Config):
+class Config(iou_by_frames.Config):
     """Settings of the experiment."""
 
-    test: TestSet = TestSet()
-    frames: tuple[int, ...] = (1, 4, 8)
-    examples: int = 1
-    """Number of chairs of either kind for each number of frames."""
-    iterations: int = 350
+    long: int = 350
     """Iterations of the long searches (paper: 350)."""
-    candidates: int = 32
-    """Chairs to choose from where iou_by_frames.py has not been run."""
-    short: int = 60
-    """Iterations of the searches on the candidates."""
 
 
 def main(config: Config) -> None:
-    config = config.reduced(frames=(4,), examples=1, iterations=2, short=2)
+    config = config.reduced(frames=(4,), iterations=2, long=2)
     journal = run(config)
     plot(journal, config)
 
 
 def run(config: Config) -> Journal:
     """Choose the chairs, search them for long, and write the results."""
-    prior = load_prior(config.weights)
-    candidates = short_searches(prior, config)
-    chosen = choose(candidates, config)
-    settings = {
-        "iterations": config.iterations,
-        "chosen": [one[:3] for one in chosen],
-        "weights": fingerprint(prior),
-    }
-    journal = Journal(config.results / "gradient_failures.json", settings)
+    known = {one.name for one in subjects(config.test)}
+    searched = iou_by_frames.run(config).rows
+    candidates = {name: row for name, row in searched.items() if name in known}
+    frames = [k for k in FRAMES if k in config.frames]
+    chosen = choose(candidates, frames)
+    prior, journal = config.begin(
+        "gradient_failures", iterations=config.long, chosen=[one[:3] for one in chosen]
+    )
     search_long(chosen, prior, config, journal)
-    shares = {str(k): wins(candidates, k) for k in config.frames}
-    found = {"shares": shares, "cases": summary(journal)}
-    conclude(journal, claims(journal, shares, config), summary=found)
+    shares = {str(k): wins(candidates, k) for k in frames}
+    journal.write({"summary": {"shares": shares} | summary(journal)})
     return journal
 
 
@@ -120,25 +97,15 @@ class Example(NamedTuple):
     """IoU of CMA-ES minus that of plain descent, after short searches."""
 
 
-def short_searches(prior: ShapePrior, config: Config) -> Rows:
-    """Scores of short searches by chair, as `compare` leaves them."""
-    known = {one.name for one in subjects(config.test)}
-    earlier = config.results / "iou_by_frames.json"
-    if earlier.is_file():
-        rows = json.loads(earlier.read_text())["rows"]
-        rows = {name: row for name, row in rows.items() if name in known}
-        if rows and all(str(k) in row for row in rows.values() for k in config.frames):
-            return rows
-    settings = {
-        "frames": config.frames,
-        "iterations": config.short,
-        "weights": fingerprint(prior),
-    }
-    journal = Journal(config.results / "gradient_failures_candidates.json", settings)
-    contestants = tuned(prior, config.short)
-    chairs = subjects(config.test)[: config.candidates]
-    compare(contestants, prior, chairs, config.frames, journal, at_a_time=24)
-    return journal.rows
+def choose(rows: Rows, frames: Sequence[int]) -> list[Example]:
+    """The chairs with the largest lead of either sign, by number of frames."""
+    chosen = []
+    for k in frames:
+        lead = leads(rows, k, "gradient descent")
+        for kind, pick in ((LEADS, max), (TRAILS, min)):
+            name = pick(lead, key=lead.__getitem__)
+            chosen.append(Example(name, k, kind, round(lead[name], 4)))
+    return chosen
 
 
 def leads(rows: Rows, frames: int, rival: str) -> dict[str, float]:
@@ -147,26 +114,11 @@ def leads(rows: Rows, frames: int, rival: str) -> dict[str, float]:
     return {name: s["CMA-ES"]["iou"] - s[rival]["iou"] for name, s in scores.items()}
 
 
-def choose(rows: Rows, config: Config) -> list[Example]:
-    """The chairs with the largest differences of either sign, by number of frames."""
-    chosen = []
-    for k in config.frames:
-        lead = leads(rows, k, "gradient descent")
-        ranked = sorted(lead, key=lambda name: -lead[name])  # noqa: B023
-        kinds = {LEADS: ranked[: config.examples], TRAILS: ranked[::-1][: config.examples]}
-        chosen += [
-            Example(name, k, kind, round(lead[name], 4))
-            for kind, names in kinds.items()
-            for name in names
-        ]
-    return chosen
-
-
 def wins(rows: Rows, frames: int) -> dict[str, dict[str, float]]:
     """Share of the chairs on which CMA-ES has the higher IoU, and its mean and extreme leads."""
     found = {}
     for rival in ("gradient descent", "Adam"):
-        lead = np.array(list(leads(rows, frames, rival).values()))
+        lead = np.array([*leads(rows, frames, rival).values()])
         figures = {"share": (lead > 0).mean(), "mean": lead.mean()}
         figures |= {"least": lead.min(), "most": lead.max(), "chairs": len(lead)}
         found[rival] = {name: round(float(x), 4) for name, x in figures.items()}
@@ -190,16 +142,13 @@ def search_long(
     """Add missing rows of examples: all searches, and all searches from the end of each one."""
     chairs = {one.name: one for one in subjects(config.test)}
     missing = [one for one in chosen if row_name(one) not in journal.rows]
-    size = min(2 * config.examples, len(missing))
+    size = min(2, len(missing))
     analyse = analysis(prior, config)
-    starts = range(0, len(missing), max(size, 1))
-    for start in track(starts, description=journal.path.stem, disable=not missing):
+    for start in track(range(0, len(missing), 2), journal.path.stem, disable=not missing):
         began = time.perf_counter()
-        batch = missing[start : start + size]
-        cases = [seen(chairs[one.name], one.frames) for one in batch]
-        keys = jnp.concatenate([case_keys(one.name, (one.frames,)) for one in batch])
-        case = jax.tree.map(lambda *x: jnp.stack(x), *cases)
-        keys, case = jax.tree.map(lambda x: fill(x, size), (keys, case))
+        batch = missing[start : start + 2]
+        seen = [observe(chairs[one.name], one.frames) for one in batch]
+        keys, case = jax.tree.map(lambda *x: fill(jnp.concatenate(x), size), *seen)
         found = jax.device_get(analyse(keys, case))
         rows = {
             row_name(one): one._asdict()
@@ -214,20 +163,16 @@ def row_name(one: Example) -> str:
     return f"{one.name}, {one.frames} frames, {one.kind}"
 
 
-def seen(chair: Subject, frames: int) -> Case:
-    """The measurement of the first frames; earlier steps have shown that the chair is usable."""
-    model = load_object(chair.item)
-    case = None if isinstance(model, Skipped) else observe(model, replace(SEEN, frames=(frames,)))
-    if case is None:
-        raise ValueError(f"{chair.name} cannot be observed: {model}. Remove the earlier results.")
-    return jax.tree.map(lambda x: jnp.asarray(x[0]), case)
+def observe(chair: Subject, frames: int) -> tuple[Key[Array, " case"], Case]:
+    """The key and the case of a chair after the first frames, a batch of one."""
+    return together(observed([chair], replace(SEEN, frames=(frames,))), (frames,))
 
 
 def analysis(prior: ShapePrior, config: Config) -> Callable[..., dict[str, Any]]:
     """A function from the keys and cases of a batch to rows; each search is compiled once."""
     first = searcher("encoder", prior, RefineConfig())
     searches = {
-        name: searcher(method, prior, replace(how, iterations=config.iterations, tolerance=0.0))
+        name: searcher(method, prior, replace(how, iterations=config.long, tolerance=0.0))
         for name, (method, how) in TUNED.items()
     }
     follow = jax.jit(objectives_between)
@@ -300,75 +245,42 @@ def ridge(row: Rows, rival: str) -> float:
 
 
 def summary(journal: Journal) -> dict[str, Any]:
-    """The deciding figures of each case, without codes."""
+    """The deciding figures of each case, without codes, and of all cases in which one leads."""
     return {
-        name: {
-            "iou": row["iou"],
-            "objective": row["objective"],
-            "falls further": {
-                start: {search: round(drop(row, start, search), 4) for search in TUNED}
-                for start in TUNED
-            },
-            "ridge": {rival: round(ridge(row, rival), 4) for rival in row["line"]},
-        }
-        for name, row in journal.rows.items()
+        "cases": {
+            name: {
+                "iou": row["iou"],
+                "objective": row["objective"],
+                "falls further": {
+                    start: {search: round(drop(row, start, search), 4) for search in TUNED}
+                    for start in TUNED
+                },
+                "ridge": {rival: round(ridge(row, rival), 4) for rival in row["line"]},
+            }
+            for name, row in journal.rows.items()
+        },
+        LEADS: leaves(journal, LEADS, "gradient descent", "CMA-ES"),
+        TRAILS: leaves(journal, TRAILS, "CMA-ES", "gradient descent"),
     }
 
 
-def claims(journal: Journal, shares: dict[str, Any], config: Config) -> list[Claim]:
-    """The paper's claim about this figure, the opposite, and the frequency of both."""
-    ahead, behind = (
-        [row for row in journal.rows.values() if row["kind"] == kind] for kind in (LEADS, TRAILS)
-    )
-    return [
-        _trapped(ahead, "gradient descent", "CMA-ES", config),
-        _trapped(behind, "CMA-ES", "gradient descent", config),
-        _how_often(shares),
-    ]
-
-
-def _trapped(rows: Sequence[Rows], loser: str, winner: str, config: Config) -> Claim:
+def leaves(journal: Journal, kind: str, loser: str, winner: str) -> dict[str, Any]:
     """Has the loser ended in a local minimum that the winner leaves, or was it only slow?
 
     It is trapped if the winner lowers the objective by more than 1 %, and more than ten times as
-    far as the loser.
+    far as the loser. The other numbers are those of the chairs after the long searches.
     """
-    own, others, adam = (
-        np.array([drop(row, loser, name) for row in rows]) for name in (loser, winner, "Adam")
-    )
-    lower = np.array([row["objective"][winner] < row["objective"][loser] for row in rows])
-    better = np.array([row["iou"][winner] > row["iou"][loser] for row in rows])
-    ridges = np.array([ridge(row, "gradient descent") > RIDGE for row in rows])
-    trapped = (others > 0.01) & (own < others / 10)
-    count = len(rows)
-    return Claim(
-        "Fig. gm_fail" if loser == "gradient descent" else "beyond",
-        f"{loser[0].upper()}{loser[1:]} is trapped in a local minimum that {winner} leaves",
-        f"{count} chairs were chosen for the lead of {winner}. After {config.iterations} iterations"
-        f" its IoU is higher on {better.sum()} of them and its objective lower on {lower.sum()}."
-        f" Started at the end point of {loser}, {winner} lowers the objective by"
-        f" {others.mean():.1%}, {loser} by {own.mean():.1%} and Adam by {adam.mean():.1%}. A ridge"
-        f" separates the two end points on {ridges.sum()}",
-        f"on {trapped.sum()} of {count}" if trapped.any() else "no",
-    )
-
-
-def _how_often(shares: dict[str, Any]) -> Claim:
-    """Share of all chairs on which CMA-ES is better."""
-    texts = [
-        f"{k} frames: better than descent on {found['gradient descent']['share']:.0%}"
-        f" ({found['gradient descent']['mean']:+.3f}), than Adam on {found['Adam']['share']:.0%}"
-        f" ({found['Adam']['mean']:+.3f})"
-        for k, found in shares.items()
-    ]
-    most = [found["gradient descent"]["share"] > 0.5 for found in shares.values()]
-    chairs = next(iter(shares.values()))["Adam"]["chairs"]
-    return Claim(
-        "Fig. gm_fail",
-        "CMA-ES uses additional frames where gradient descent is stuck",
-        f"IoU of CMA-ES on {chairs:.0f} chairs after short searches, " + "; ".join(texts),
-        "on most chairs" if all(most) else "on few chairs" if not any(most) else "in part",
-    )
+    rows = [row for row in journal.rows.values() if row["kind"] == kind]
+    falls = {name: np.array([drop(row, loser, name) for row in rows]) for name in TUNED}
+    trapped = (falls[winner] > 0.01) & (falls[loser] < falls[winner] / 10)
+    return {
+        "chairs": len(rows),
+        "higher IoU": sum(row["iou"][winner] > row["iou"][loser] for row in rows),
+        "lower objective": sum(row["objective"][winner] < row["objective"][loser] for row in rows),
+        "ridges": sum(ridge(row, "gradient descent") > RIDGE for row in rows),
+        "trapped": int(trapped.sum()),
+        "falls further": {name: round(float(fall.mean()), 4) for name, fall in falls.items()},
+    }
 
 
 # ------------------------------------------------------------------ figures
@@ -400,7 +312,8 @@ def plot(journal: Journal, config: Config) -> None:
 def panels(row: Rows, prior: ShapePrior, config: Config) -> Iterator[Any]:
     """Truth, F and every search's shape, its IoU below."""
     chair = next(one for one in subjects(config.test) if one.name == row["name"])
-    (occupied, occluded, _), surface = jax.device_get(seen(chair, row["frames"]))
+    _, case = observe(chair, row["frames"])
+    (occupied, occluded, _), surface = jax.tree.map(lambda x: np.asarray(x[0]), case)
     codes = jnp.array([row["code"][name] for name in SHAPES])
     shapes = np.asarray(decode(prior, codes) > 0)
     yield grid_panel("truth", surface, "truth", note=row["group"])

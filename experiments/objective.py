@@ -29,7 +29,6 @@ import study
 from figures import PAGE, interval, save_column
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode, encode
-from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.report.figures import tidy
 from jaxshape.report.palette import BLUE, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
@@ -42,14 +41,11 @@ from jaxshape.search.residuals import Weights, weigh
 from jaxshape.search.run import refine
 from study import (
     SEARCH,
-    Claim,
     Contestant,
     TestSet,
     by_method,
     compare,
-    conclude,
     gain,
-    mean_interval,
     mean_low_high,
 )
 
@@ -116,23 +112,18 @@ def main(config: Config) -> None:
 
 def run(config: Config, residuals: dict[str, Residual] = RESIDUALS) -> tuple[Journal, Journal]:
     """Minimise every residual for every chair, without and with noise; write the results."""
-    prior = load_prior(config.weights)
-    settings = {
-        "frames": config.frames,
-        "iterations": config.iterations,
-        "weights": fingerprint(prior),
-    }
+    settings = {"frames": config.frames, "iterations": config.iterations}
+    prior, clean = config.begin("objective", **settings)
+    _, noisy = config.begin("objective_noise", **settings)
     contestants = {"encoder": by_method("encoder", prior, SEARCH)} | {
         name: by_residual(residual, prior, config.iterations)
         for name, residual in residuals.items()
     }
     robust = {name: contestants[name] for name in ("encoder", *NOISY) if name in contestants}
-    clean = Journal(config.results / "objective.json", settings)
-    noisy = Journal(config.results / "objective_noise.json", settings)
     compare(contestants, prior, config.test, config.frames, clean)
     compare(robust, prior, config.test, config.frames, noisy, noise=True)
-    noisy.write({"summary": summary(noisy, config)})
-    conclude(clean, claims(clean, noisy, config), summary=summary(clean, config))
+    for journal in (clean, noisy):
+        journal.write({"summary": summary(journal, config)})
     return clean, noisy
 
 
@@ -173,74 +164,28 @@ def printed_alpha(occluded: Bool[Array, "case x y z"]) -> Float[Array, "case 1 1
 
 
 def summary(journal: Journal, config: Config) -> dict[str, Any]:
-    """`summary[residual][frames]`: gains over the encoder, each as [mean, low, high]."""
+    """Gains over the encoder by residual and number of frames, each as [mean, low, high].
 
-    def gains(name: str, k: int) -> dict[str, list[float]]:
-        each = {
-            score: gain(journal, None, k, name, score=score) for score in ("iou", "iou_composed")
-        }
-        return {score: mean_low_high(v) for score, v in each.items()}
+    `all` is the mean gain of decoded and composed shapes over all numbers of frames, minus that of
+    Eq. 7 as printed, and minus that of the default.
+    """
 
-    return {
-        name: {str(k): gains(name, k) for k in config.frames} for name in _names(journal, config)
-    }
+    def overall(name: str) -> np.ndarray:
+        gains = [gain(journal, None, k, name, score=s) for k in config.frames for s in SCORES]
+        return np.mean(gains, axis=0)
+
+    def of(name: str) -> dict[str, Any]:
+        return {
+            str(k): {s: mean_low_high(gain(journal, None, k, name, score=s)) for s in SCORES}
+            for k in config.frames
+        } | {"all": {r: mean_low_high(overall(name) - overall(r)) for r in (PAPER, DEFAULT)}}
+
+    return {name: of(name) for name in _names(journal, config)}
 
 
 def _names(journal: Journal, config: Config) -> list[str]:
     row = next(iter(journal.rows.values()))[str(config.frames[0])]
     return [name for name in row if name != "encoder"]
-
-
-def claims(clean: Journal, noisy: Journal, config: Config) -> list[Claim]:
-    """The prototype's claim, and which residual is best."""
-    few, some = config.frames[:2]
-
-    def gains(journal: Journal, name: str, score: str = "iou") -> str:
-        each = [f"{gain(journal, None, k, name, score=score).mean():+.3f}" for k in config.frames]
-        return " / ".join(each)
-
-    def over_paper(journal: Journal) -> str:
-        return mean_interval(overall(journal, config, DEFAULT) - overall(journal, config, PAPER))
-
-    paper = {k: interval(gain(clean, None, k, PAPER)) for k in config.frames}
-    helped = np.mean([gain(clean, None, k, DEFAULT) for k in config.frames[1:]])
-    printed = np.mean([gain(clean, None, k, PAPER) for k in config.frames[1:]])
-    at = f"at {' / '.join(map(str, config.frames))} frames"
-    best = max(_names(clean, config), key=lambda name: overall(clean, config, name).mean())
-    return [
-        Claim(
-            "Eq. 7",
-            "As printed, refinement hurts slightly at one frame and helps from four",
-            f"IoU gained {at}: {gains(clean, PAPER)}",
-            "yes" if paper[few][1] < 0 < paper[some][0] else "no",
-        ),
-        Claim(
-            "beyond",
-            "With a third of the weight on measured free space, refinement helps twice as much",
-            f"IoU gained {at}: {gains(clean, DEFAULT)}; with noise {gains(noisy, DEFAULT)}, against"
-            f" {gains(noisy, PAPER)} as printed",
-            "yes" if helped >= 2 * printed > 0 else "less than twice" if helped > printed else "no",
-        ),
-        Claim(
-            "beyond",
-            "No other residual is better than the default",
-            "Gain in mean IoU of decoded and composed shapes over Eq. 7 as printed:"
-            f" {over_paper(clean)}, with noise {over_paper(noisy)}. Best without noise: {best}, "
-            + mean_interval(overall(clean, config, best) - overall(clean, config, DEFAULT))
-            + " over the default",
-            "yes" if best == DEFAULT else "with noise only",
-        ),
-    ]
-
-
-def overall(journal: Journal, config: Config, name: str) -> np.ndarray:
-    """Gain of each chair over the encoder, mean over decoded and composed, and over frames."""
-    each = [
-        gain(journal, None, k, name, score=s)
-        for k in config.frames
-        for s in ("iou", "iou_composed")
-    ]
-    return np.mean(each, axis=0)
 
 
 def plot(journals: dict[str, Journal], config: Config) -> None:

@@ -26,10 +26,9 @@ from jaxtyping import Array
 
 import study
 from figures import PAGE, draw_mean, save_column
-from jaxshape.geometry.grid import RESOLUTION
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior
-from jaxshape.model.weights import fingerprint, load_prior
+from jaxshape.model.weights import load_prior
 from jaxshape.report.figures import tidy
 from jaxshape.report.palette import BLUE, GREEN, GREY, INK, ORANGE
 from jaxshape.results.evaluation import Case
@@ -38,13 +37,11 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.methods.gradient import LEARNING_RATE, STEP_SIZES
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 from study import (
-    Claim,
     Contestant,
     Scores,
     TestSet,
     compare,
-    conclude,
-    mean_interval,
+    mean_low_high,
 )
 
 CASES_AT_A_TIME = 15
@@ -104,20 +101,19 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Try every value on every chair, and write the results."""
-    prior = load_prior(config.weights)
-    settings = {
-        "frames": config.frames,
-        "iterations": config.iterations,
-        "trials": TRIALS,
-        "weights": fingerprint(prior),
+    codes = load_prior(config.weights).code_covariance
+    prior, journal = config.begin(
+        "step_size",
+        frames=config.frames,
+        iterations=config.iterations,
+        trials=TRIALS,
         # Root mean square over the coordinates of the codes' standard deviations.
-        "deviation_of_codes": round(float(jnp.sqrt(jnp.diag(prior.code_covariance).mean())), 4),
-    }
-    journal = Journal(config.results / "step_size.json", settings)
+        deviation_of_codes=round(float(jnp.sqrt(jnp.diag(codes).mean())), 4),
+    )
     search = RefineConfig(iterations=config.iterations, tolerance=0.0)
     contestants = {method: trying(method, search) for method in TRIALS}
     compare(contestants, prior, config.test, config.frames, journal, at_a_time=CASES_AT_A_TIME)
-    conclude(journal, claims(journal, config), summary=summary(journal, config))
+    journal.write({"summary": summary(journal, config)})
     return journal
 
 
@@ -185,36 +181,21 @@ def gain(journal: Journal, frames: int, method: str) -> np.ndarray:
     return scores(journal, frames, method, "iou") - scores(journal, frames, method, "start_iou")
 
 
-def overshoots(journal: Journal, frames: int, method: str) -> np.ndarray:
-    """Share of the chairs whose last loss is above the first, with each value."""
-    last, start = (scores(journal, frames, method, score) for score in ("last", "start"))
-    return (last > start).mean(axis=0)
-
-
-def best_of(journal: Journal, config: Config, method: str) -> dict[str, Trial]:
-    """The value with the largest fall: for each number of frames, and for all in the mean."""
-    falls = {str(k): fall(journal, k, method) for k in config.frames}
-    falls["all"] = np.mean(list(falls.values()), axis=0)
-    return {k: TRIALS[method][int(np.argmax(values))] for k, values in falls.items()}
-
-
-def best_in(journal: Journal, config: Config, method: str, space: str) -> Trial:
-    """The best value in one of the spaces, over all numbers of frames."""
-    falls = np.mean([fall(journal, k, method) for k in config.frames], axis=0)
-    trials = [(part, trial) for part, trial in zip(falls, TRIALS[method], strict=True)
-              if trial.space == space]  # fmt: skip
-    return max(trials)[1]
-
-
 def summary(journal: Journal, config: Config) -> dict[str, Any]:
-    """The best values, and the figures of each value and number of frames."""
+    """The figures of each value and number of frames, the best values, and the default's loss.
+
+    The best value has the largest share of the best falls, over all numbers of frames or for each,
+    in both spaces or in one. `default less best` is the IoU of the default minus that of the value
+    which is best for each number of frames, over all chairs and numbers of frames.
+    """
 
     def of(method: str, k: int) -> dict[str, Any]:
+        start, last = (scores(journal, k, method, score) for score in ("start", "last"))
         means = {
             "objective": scores(journal, k, method, "objective").mean(axis=0),
             "part_of_best_fall": fall(journal, k, method),
             "iou_gained": gain(journal, k, method).mean(axis=0),
-            "overshoots": overshoots(journal, k, method),
+            "overshoots": (last > start).mean(axis=0),
             "rises": scores(journal, k, method, "rises").mean(axis=0),
             "moved": scores(journal, k, method, "moved").mean(axis=0),
         }
@@ -223,10 +204,27 @@ def summary(journal: Journal, config: Config) -> dict[str, Any]:
             for i, trial in enumerate(TRIALS[method])
         }
 
+    def best(method: str) -> dict[str, Any]:
+        trials = TRIALS[method]
+        falls = {str(k): fall(journal, k, method) for k in config.frames}
+        falls["all"] = np.mean([*falls.values()], axis=0)
+        default, differences = trials.index(DEFAULTS[method]), []
+        for k in config.frames:
+            gained = gain(journal, k, method)
+            differences.append(gained[:, default] - gained[:, np.argmax(falls[str(k)])])
+        inside = {
+            space: [
+                falls["all"][i] if trial.space == space else -1 for i, trial in enumerate(trials)
+            ]
+            for space in dict.fromkeys(trial.space for trial in trials)
+        }
+        return {
+            "best": {k: text(trials[int(np.argmax(x))]) for k, x in (falls | inside).items()},
+            "default less best": mean_low_high(np.concatenate(differences)),
+        }
+
     return {
-        method: {"best": {k: text(trial) for k, trial in best_of(journal, config, method).items()}}
-        | {str(k): of(method, k) for k in config.frames}
-        for method in TRIALS
+        method: best(method) | {str(k): of(method, k) for k in config.frames} for method in TRIALS
     }
 
 
@@ -234,143 +232,9 @@ def text(trial: Trial) -> str:
     return f"{trial.step:g} {'in codes' if trial.space == 'raw' else 'whitened'}"
 
 
-def parts(journal: Journal, config: Config, method: str, trial: Trial) -> list[float]:
-    """Share of the best decrease that a value attains, for each number of frames."""
-    i = TRIALS[method].index(trial)
-    return [float(fall(journal, k, method)[i]) for k in config.frames]
-
-
-def percents(journal: Journal, config: Config, method: str, trial: Trial) -> str:
-    return ", ".join(f"{part:.0%}" for part in parts(journal, config, method, trial))
-
-
-def claims(journal: Journal, config: Config) -> list[Claim]:
-    """The paper's claims about this figure, our findings, and their consequences."""
-    return [
-        papers_step(journal, config),
-        papers_sigma(journal, config),
-        papers_scales(journal, config),
-        steady(journal, config),
-        defaults(journal, config),
-        spaces(journal, config),
-    ]
-
-
-def papers_step(journal: Journal, config: Config) -> Claim:
-    method, trial = DESCENT, PAPERS[DESCENT]
-    best = best_in(journal, config, method, "raw")
-    longest = max(one.step for one in TRIALS[method] if one.space == "raw")
-    edge = ", the longest tried," if best.step == longest else ""
-    raw = [i for i, one in enumerate(TRIALS[method]) if one.space == "raw"]
-    ending_above = np.max([overshoots(journal, k, method) for k in config.frames], axis=0)
-    too_long = [TRIALS[method][i].step for i in raw if ending_above[i] > 0.1]
-    is_fast = min(parts(journal, config, method, trial)) > 0.8
-    is_kept = trial.step not in too_long
-
-    return Claim(
-        "Fig. gm right",
-        "A step of 0.14 leads to fast convergence without overshooting",
-        f"It achieves {percents(journal, config, method, trial)} of the best step's decrease at"
-        f" {_listed(config.frames)} frames in {config.iterations} iterations; {text(best)}{edge} is"
-        " the best step. Steps after which a tenth of the chairs end above the start:"
-        f" {_listed(too_long) or 'none'}",
-        "yes" if is_fast and is_kept else "not fast" if is_kept else "no",
-    )
-
-
-def papers_sigma(journal: Journal, config: Config) -> Claim:
-    method, trial = "CMA-ES", PAPERS["CMA-ES"]
-    deviation = journal.settings["deviation_of_codes"]
-    return Claim(
-        "Sec. 4",
-        "sigma0 = 2 is best for CMA-ES",
-        f"It achieves {percents(journal, config, method, trial)} of the best sigma0's decrease at"
-        f" {_listed(config.frames)} frames: 2 is {trial.step / deviation:.1f} standard deviations"
-        " of the codes. The best value in this space is"
-        f" {text(best_in(journal, config, method, 'raw'))}",
-        "yes" if min(parts(journal, config, method, trial)) > 0.9 else "no",
-    )
-
-
-def papers_scales(journal: Journal, config: Config) -> Claim:
-    """Codes c times as long need c times the sigma0, and c^2 times the step."""
-    sigma, step = (best_in(journal, config, method, "raw").step for method in ("CMA-ES", DESCENT))
-    longer = PAPERS["CMA-ES"].step / sigma
-    louder = longer**2 * step / PAPERS[DESCENT].step
-    return Claim(
-        "beyond",
-        "The paper's two values follow from the scale of its codes and of its loss",
-        f"2 would be the best sigma0 for codes {longer:.0f} times as long. For such codes, 0.14"
-        f" would be the best step for a loss {louder:.1g} times as large; the loss without the"
-        " factor 1 / N^3 is 3e+04 times as large",
-        "plausible" if 0.1 < louder / RESOLUTION**3 < 10 else "not from these two alone",
-    )
-
-
-def steady(journal: Journal, config: Config) -> Claim:
-    best = {method: best_of(journal, config, method) for method in TRIALS}
-    return Claim(
-        "beyond",
-        f"One value suffices for {_listed(config.frames)} frames",
-        "; ".join(
-            f"{method} {text(best[method]['all'])}:"
-            f" {percents(journal, config, method, best[method]['all'])} of the best decreases"
-            for method in TRIALS
-        ),
-        _which({m: min(parts(journal, config, m, best[m]["all"])) > 0.9 for m in TRIALS}),
-    )
-
-
-def defaults(journal: Journal, config: Config) -> Claim:
-    def against_best(method: str) -> str:
-        here = TRIALS[method].index(DEFAULTS[method])
-        best = best_of(journal, config, method)
-        differences = [
-            gain(journal, k, method)[:, here]
-            - gain(journal, k, method)[:, TRIALS[method].index(best[str(k)])]
-            for k in config.frames
-        ]
-        return (
-            f"{method}, {text(DEFAULTS[method])}:"
-            f" {percents(journal, config, method, DEFAULTS[method])} of the best decreases,"
-            f" IoU {mean_interval(np.concatenate(differences))} relative to the best value"
-        )
-
-    return Claim(
-        "beyond",
-        "The defaults are as good as the best values",
-        "; ".join(map(against_best, TRIALS)),
-        _which({m: min(parts(journal, config, m, DEFAULTS[m])) > 0.9 for m in TRIALS}),
-    )
-
-
-def spaces(journal: Journal, config: Config) -> Claim:
-    best = {
-        method: [best_in(journal, config, method, space) for space in ("raw", "whitened")]
-        for method in PAPERS
-    }
-    return Claim(
-        "beyond",
-        "The codes themselves serve as well as whitened ones",
-        "; ".join(
-            f"{method}: "
-            + ", ".join(f"{text(t)} {percents(journal, config, method, t)}" for t in best[method])
-            + " of the best decreases"
-            for method in PAPERS
-        ),
-        _which({m: min(parts(journal, config, m, best[m][0])) > 0.9 for m in PAPERS}),
-    )
-
-
-def _listed(values: Sequence[Any]) -> str:
-    return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in values)
-
-
-def _which(holds: dict[str, bool]) -> str:
-    names = [name for name, does in holds.items() if does]
-    return (
-        "yes" if len(names) == len(holds) else f"for {' and '.join(names)} only" if names else "no"
-    )
+def places(method: str, space: str) -> list[int]:
+    """Places of the values of a method in one of the spaces."""
+    return [i for i, trial in enumerate(TRIALS[method]) if trial.space == space]
 
 
 def plot(journal: Journal, config: Config) -> None:
@@ -384,8 +248,7 @@ def plot(journal: Journal, config: Config) -> None:
         for method, above, below in zip(TRIALS, upper, lower, strict=True):
             for k in config.frames:
                 for space, dash in dashes.items():
-                    chosen = [i for i, trial in enumerate(TRIALS[method]) if trial.space == space]
-                    if not chosen:
+                    if not (chosen := places(method, space)):
                         continue
                     steps = [TRIALS[method][i].step for i in chosen]
                     start = scores(journal, k, method, "start")[:, chosen]
@@ -427,7 +290,7 @@ def plot_curves(journal: Journal, config: Config) -> None:
         )
         panels = figure.subplots(1, 2, sharey=True)
         for space, axes in zip(("raw", "whitened"), panels, strict=True):
-            chosen = [i for i, trial in enumerate(TRIALS[method]) if trial.space == space]
+            chosen = places(method, space)
             for number, i in enumerate(chosen):
                 axes.plot(
                     sampled(config.iterations),

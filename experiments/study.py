@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Key, Num
 from rich.progress import Progress, TimeElapsedColumn
 
-from figures import LINES, PAGE, draw_mean, interval, save_column
+import runs
+from figures import LINES, PAGE, draw_mean, interval, number_axis, save_column
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.dataset import Object, hash_seed, load_object
 from jaxshape.data.families import TEST_SEEDS, procedural_objects
@@ -24,14 +25,12 @@ from jaxshape.data.meshes import Skipped
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.config import Architecture, Completion
 from jaxshape.model.shapes import ShapePrior
-from jaxshape.report.figures import tidy
+from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
 from jaxshape.results.journal import Journal
 from jaxshape.results.metrics import bounds
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, reconstruct, refiner_for
-
-RESULTS = Path(__file__).parent / "results"
 
 CASES_AT_A_TIME = 64
 """Number of cases searched together, unless a chair has more: they are written to the journal
@@ -69,21 +68,21 @@ class TestSet:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
     """Settings that the scripts of the paper share."""
 
     test: TestSet = TestSet()
     weights: Path = Path("chair-autoencoder")
     """Weights of the shape prior; the package's by default."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Few procedural chairs and iterations, as a test."""
 
     def reduced(self, *, chairs: int = 2, **few: Any) -> Self:
-        """The settings of the run: with few chairs and other small settings for a smoke test."""
-        if not self.smoke:
-            return self
-        return replace(self, test=replace(self.test, chairs=chairs, seats=0), **few)
+        """The settings of the run: with few procedural chairs alone in a test run."""
+        return super().reduced(test=replace(self.test, chairs=chairs, seats=0), **few)
+
+    def begin(self, name: str, **settings: Any) -> tuple[ShapePrior, Journal]:
+        """The prior, and the rows that were made with its weights and these settings."""
+        prior = load_prior(self.weights)
+        return prior, self.journal(name, weights=fingerprint(prior), **settings)
 
 
 class Subject(NamedTuple):
@@ -185,9 +184,7 @@ def compare(
             if not batch:
                 continue
             left = _left(contestants, [one for one, _ in batch], journal)
-            keys = jnp.concatenate([case_keys(one.name, frames) for one, _ in batch])
-            case = jax.tree.map(lambda *x: jnp.concatenate(x), *[case for _, case in batch])
-            keys, case = jax.tree.map(lambda x: fill(x, size), (keys, case))
+            keys, case = jax.tree.map(lambda x: fill(x, size), together(batch, frames))
             found = {}
             for name in left:
                 if name not in compiled:
@@ -218,6 +215,15 @@ def observed(chairs: Sequence[Subject], config: EvaluateConfig) -> Iterator[tupl
             yield chair, case
 
 
+def together(
+    batch: Iterable[tuple[Subject, Case]], frames: Sequence[int]
+) -> tuple[Key[Array, " case"], Case]:
+    """The random keys and the cases of some chairs, one after the other."""
+    chairs, cases = zip(*batch, strict=True)
+    keys = jnp.concatenate([case_keys(chair.name, frames) for chair in chairs])
+    return keys, jax.tree.map(lambda *x: jnp.concatenate(x), *cases)
+
+
 def tiny(architecture: Architecture | Completion) -> Architecture | Completion:
     """A network of the same kind that is trained in seconds."""
     if isinstance(architecture, Completion):
@@ -242,45 +248,22 @@ def _row(
     row = journal.rows.get(chair.name, {"group": chair.group})
     for i, k in enumerate(frames, start=place * len(frames)):
         row[str(k)] = row.get(str(k), {}) | {
-            name: {score: _rounded(values[i].tolist()) for score, values in scores.items()}
+            name: {score: rounded(values[i].tolist()) for score, values in scores.items()}
             for name, scores in found.items()
         }
     return row
 
 
-def _rounded(value: Any) -> Any:
-    """To five significant digits."""
-    if isinstance(value, list):
-        return [_rounded(v) for v in value]
+def rounded(value: Any) -> Any:
+    """Numbers for JSON, to five significant digits; lists and arrays of them, too."""
+    if isinstance(value, list | tuple | np.ndarray):
+        return [rounded(v) for v in value]
     return float(f"{value:.5g}") if isinstance(value, float) else value
-
-
-class Claim(NamedTuple):
-    """A claim of the paper and our finding: a row of the table in docs/paper.md."""
-
-    figure: str
-    """Figure of the paper, or `beyond`."""
-    claim: str
-    ours: str
-    """The finding, with its figures."""
-    holds: str
-    """`yes`, `no`, or the part that holds."""
-
-
-def conclude(journal: Journal, claims: Iterable[Claim], **findings: Any) -> None:
-    """Write the findings into the results file: the claims for docs/paper.md, and more."""
-    journal.write({"claims": [claim._asdict() for claim in claims]} | findings)
 
 
 def mean_low_high(values: Num[np.ndarray, " n"]) -> list[float]:
     """The mean and the ends of its 95 % interval, as numbers for JSON."""
-    return [_rounded(float(x)) for x in (values.mean(), *interval(values))]
-
-
-def mean_interval(values: Num[np.ndarray, " n"]) -> str:
-    """The mean with its 95 % interval, as text: `+0.043 (0.040 to 0.047)`."""
-    mean, low, high = mean_low_high(values)
-    return f"{mean:+.3f} ({low:.3f} to {high:.3f})"
+    return rounded((values.mean(), *interval(values)))
 
 
 def column(
@@ -308,36 +291,35 @@ def curves_by_frames(
     journal: Journal, group: str, frames: Sequence[int]
 ) -> dict[str, list[np.ndarray]]:
     """IoU of the encoder, the `TUNED` searches, composed, and F: an array for each number."""
-
-    def of(contestant: str, score: str = "iou") -> list[np.ndarray]:
-        return [column(journal, group, k, contestant, score) for k in frames]
-
-    return {name: of(name) for name in ("encoder", *TUNED)} | {
-        "CMA-ES, composed": of("CMA-ES", "iou_composed"),
-        "F, occluded empty": of("F", "occluded_empty"),
-        "F, occluded full": of("F", "occluded_full"),
+    curves = {name: (name, "iou") for name in ("encoder", *TUNED)} | {
+        "CMA-ES, composed": ("CMA-ES", "iou_composed"),
+        "F, occluded empty": ("F", "occluded_empty"),
+        "F, occluded full": ("F", "occluded_full"),
     }
+    return {
+        name: [column(journal, group, k, *score) for k in frames] for name, score in curves.items()
+    }
+
+
+LEADS = [("CMA-ES", name) for name in ("encoder", "gradient descent", "Adam", "F, occluded empty")]
+LEADS += [("CMA-ES, composed", "F, occluded empty")]
 
 
 def summary(
     journal: Journal,
+    group: str,
     frames: Sequence[int],
-    more: Mapping[str, Mapping[str, list[np.ndarray]]] | None = None,
-) -> dict[str, Any]:
-    """Mean and interval of every curve: `summary[group][curve][frames] = [mean, low, high]`.
+    more: Mapping[str, list[np.ndarray]] | None = None,
+) -> dict[str, dict[str, list[float]]]:
+    """Mean and interval of all curves of a group, of `LEADS` and of further curves.
 
-    Args:
-        journal: The rows.
-        frames: Numbers of frames, one for each value of a curve.
-        more: Further curves, by group and name.
+    The result is `summary[curve][frames] = [mean, low, high]`.
     """
-    curves = {group: curves_by_frames(journal, group, frames) for group in groups(journal)}
+    curves = curves_by_frames(journal, group, frames)
+    leads = {f"{a} less {b}": np.subtract(curves[a], curves[b]) for a, b in LEADS}
     return {
-        group: {
-            name: {str(k): mean_low_high(x) for k, x in zip(frames, curve, strict=True)}
-            for name, curve in (of_group | dict((more or {}).get(group, {}))).items()
-        }
-        for group, of_group in curves.items()
+        name: {str(k): mean_low_high(x) for k, x in zip(frames, curve, strict=True)}
+        for name, curve in (curves | leads | dict(more or {})).items()
     }
 
 
@@ -358,10 +340,7 @@ def plot_curves(stem: Path, journal: Journal, frames: Sequence[int], title: str)
             for name, curve in curves.items():
                 draw_mean(axes, frames, np.stack(curve, axis=1), label=name, **LINES[name])
             count = len(next(iter(curves.values()))[0])
-            axes.set(xscale="log", xlabel="frames", title=title.format(count, group))
-            axes.set_xticks(frames, [str(k) for k in frames])
-            axes.minorticks_off()
-            tidy(axes)
+            number_axis(axes, frames, xlabel="frames", title=title.format(count, group))
         panels[0].set_ylabel("IoU")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)

@@ -19,7 +19,7 @@ from study import (
     column,
     compare,
     groups,
-    mean_interval,
+    mean_low_high,
     measurement,
     subjects,
 )
@@ -145,7 +145,7 @@ def test_a_folder_without_seats_is_an_error():
 
 
 def test_a_mean_is_told_with_its_interval():
-    assert mean_interval(np.full(4, 0.25)) == "+0.250 (0.250 to 0.250)"
+    assert mean_low_high(np.full(4, 0.25)) == [0.25, 0.25, 0.25]
 
 
 def test_columns_follow_the_rows(journal):

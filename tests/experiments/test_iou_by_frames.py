@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 
+from iou_by_frames import solid, voluminous
 from study import TestSet
-from voluminous import solid, voluminous
 
 
 def test_solids_are_surfaces_with_their_holes_filled():
@@ -24,5 +24,5 @@ def test_solids_are_surfaces_with_their_holes_filled():
 
 
 def test_voluminous_chairs_are_few_and_the_same_each_time():
-    found = [chair.name for chair in voluminous(TestSet(chairs=11, seats=0), 0.35)]
+    found = [chair.name for chair in voluminous(TestSet(chairs=11, seats=0))]
     assert sorted(found) == ["chair-1000009", "chair-1000010"]
