@@ -13,16 +13,15 @@ places and frequencies of parts, but not how round a part is.
 
 Expected mean IoU with the nearest neighbour: CAD seats 0.41 with procedural chairs and 0.38 with
 box chairs; box chairs 0.43 with procedural chairs and 0.60 with other box chairs, many of which are
-nearly the same; procedural chairs 0.49 with other procedural chairs. About four minutes on one
-core; grids are kept in `--cache`, so that a second run takes one or two. Empty that folder after a
-change to the statistics of points.
+nearly the same; procedural chairs 0.49 with other procedural chairs.
+
+Results: experiments/results/procedural_vs_real.json and .png. Time: four minutes on one core.
 """
 
-import hashlib
 import json
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,56 +33,55 @@ from jaxtyping import Bool, Float, Int
 from rich.progress import track
 from scipy import ndimage, stats
 
-import jaxshape.data.chairs
+import runs
 from jaxshape.data import meshes
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.chairs import random_chair
-from jaxshape.files import atomic_path, write_json
+from jaxshape.files import write_json
 from jaxshape.geometry import grid
 from jaxshape.geometry.grid import MARGIN, RESOLUTION
 from jaxshape.report.figures import save_figure
 from jaxshape.report.palette import BLUE, FAINT, GREEN, ORANGE
 
-RESULTS = Path(__file__).parent / "results"
-
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
     """Sources to compare, and output."""
 
-    cad: Path
+    cad: Path = Path("cad_chairs")
     """Folder of CAD seats, +y up, front along +z."""
     boxes: Path | None = None
     """An .npz of box chairs; without it, the CAD seats are the only reference."""
     chairs: int = 5_000
     """Number of procedural chairs, with seeds from 0; also the number of box chairs in their place.
     """
-    cache: Path = Path("out/procedural_vs_real")
-    """Folder that keeps the grids of each source."""
-    output: Path = RESULTS / "procedural_vs_real.json"
-    """The results; the figure has the same name, as .png."""
     write_boxes: Path | None = None
     """Only write the first --chairs of --boxes here, as meshes to train on for comparison."""
-    smoke: bool = False
-    """A test run with 20 procedural chairs and as many box chairs."""
 
 
 # ------------------------------------------------------------------ sources
 
 
-def procedural_chairs(count: int) -> Iterator[tuple[str, trimesh.Trimesh]]:
+Named = Iterator[tuple[str, trimesh.Trimesh]]
+Grid = Bool[np.ndarray, "x y z"]
+Grids = Bool[np.ndarray, "n x y z"]
+Points = Float[np.ndarray, "n 3"]
+Values = Float[np.ndarray, " n"]
+
+
+def procedural_chairs(count: int) -> Named:
     for seed in range(count):
         mesh = random_chair(seed)
         yield f"{seed} {mesh.metadata['style']}", mesh
 
 
-def cad_seats(folder: Path) -> Iterator[tuple[str, trimesh.Trimesh]]:
+def cad_seats(folder: Path) -> Named:
     for model in meshes.read_meshes(folder):
         if isinstance(model, meshes.Model):
             yield model.name, model.mesh
 
 
-def box_chairs(path: Path, count: int | None) -> Iterator[tuple[str, trimesh.Trimesh]]:
+def box_chairs(path: Path, count: int | None) -> Named:
     with np.load(path) as file:
         ends = np.cumsum(file["count"])
         chairs = np.split(file["boxes"].astype(float), ends[:-1])
@@ -117,15 +115,15 @@ class Seats(NamedTuple):
     back_thickness: Float[np.ndarray, " seat"]
 
 
-LEG_LAYER = slice(5, 6)
+LEG_LAYER = 5
 """The layer in which legs are counted and measured: at 15 % of the height, above most feet and
 runners, below most stretchers."""
 
 
-def measure(source: Iterator[tuple[str, trimesh.Trimesh]], total: int | None, what: str) -> Seats:
+def measure(source: Iterable[tuple[str, trimesh.Trimesh]], what: str) -> Seats:
     """Grids of all the meshes, and statistics that need finer detail than grids."""
     names, rows = [], []
-    for seed, (name, mesh) in enumerate(track(source, what, total)):
+    for seed, (name, mesh) in enumerate(track(source, what)):
         frame = grid.fit_box(*jnp.float32(mesh.bounds))
         points = meshes.sample_surface(mesh, SURFACE_SAMPLES, seed).astype(np.float32)
         surface = np.asarray(discretize(points, frame))
@@ -138,29 +136,23 @@ def measure(source: Iterator[tuple[str, trimesh.Trimesh]], total: int | None, wh
     return Seats(names, *(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def leg_thickness(
-    points: Float[np.ndarray, "n 3"],
-    voxel: Int[np.ndarray, "n 3"],
-    surface: Bool[np.ndarray, "x y z"],
-) -> float:
+def leg_thickness(points: Points, voxel: Int[np.ndarray, "n 3"], surface: Grid) -> float:
     """The median, over the pieces of a layer near the floor, of the smaller horizontal extent."""
     pieces, count = components(surface)
-    here = (voxel[:, 1] >= LEG_LAYER.start) & (voxel[:, 1] < LEG_LAYER.stop)
+    here = voxel[:, 1] == LEG_LAYER
     piece, places = pieces[voxel[here, 0], voxel[here, 2]], points[here][:, [0, 2]]
     members = [places[piece == i + 1] for i in range(count)]
     sizes = [np.ptp(m, axis=0).min() for m in members if len(m) >= 10]
     return float(np.median(sizes)) if sizes else np.nan
 
 
-def components(surface: Bool[np.ndarray, "x y z"]) -> tuple[Int[np.ndarray, "x z"], int]:
+def components(surface: Grid) -> tuple[Int[np.ndarray, "x z"], int]:
     """The pieces, labelled from 1, into which the layer near the floor falls."""
-    found: Any = ndimage.label(surface[:, LEG_LAYER].any(axis=1), np.ones((3, 3)))
+    found: Any = ndimage.label(surface[:, LEG_LAYER], np.ones((3, 3)))
     return found
 
 
-def back_thickness(
-    points: Float[np.ndarray, "n 3"], voxel: Int[np.ndarray, "n 3"], seat: float
-) -> float:
+def back_thickness(points: Points, voxel: Int[np.ndarray, "n 3"], seat: float) -> float:
     """The median extent from front to back, over thin horizontal bars across the back's middle.
 
     The bars are one voxel wide and a quarter high, so that a back that leans seems little thicker.
@@ -180,29 +172,6 @@ def back_thickness(
     return float(np.median(sizes)) if sizes else np.nan
 
 
-def cached(path: Path, source: Iterator[tuple[str, trimesh.Trimesh]], total: int | None) -> Seats:
-    """`measure`, or its earlier result."""
-    if not path.exists():
-        seats = measure(source, total, path.stem.split("-")[0])
-        packed = seats._replace(surface=np.packbits(seats.surface.reshape(len(seats.names), -1), 1))
-        with atomic_path(path) as temporary:
-            np.savez(temporary, **packed._asdict())
-    with np.load(path) as file:
-        columns = {field: file[field] for field in Seats._fields}
-    bits = np.unpackbits(columns.pop("surface"), axis=1).astype(bool)
-    names = columns.pop("names").tolist()
-    return Seats(names, bits.reshape(-1, *[RESOLUTION] * 3), **columns)
-
-
-def fingerprint(*paths: Path) -> str:
-    """A short hash of files, and of all the files in folders."""
-    files = [f for p in paths for f in (sorted(p.rglob("*.*")) if p.is_dir() else [p])]
-    digest = hashlib.sha256()
-    for file in (f for f in files if f.is_file() and f.suffix != ".pyc"):
-        digest.update(file.name.encode() + file.read_bytes())
-    return digest.hexdigest()[:12]
-
-
 # ------------------------------------------------------------------ statistics of a grid
 
 
@@ -211,7 +180,7 @@ CENTER, FRONT, REAR = slice(12, 20), slice(12, 24), slice(0, 16)
 INSIDE = RESOLUTION - 2 * MARGIN
 
 
-def seat_layer(surface: Bool[np.ndarray, "n x y z"]) -> Float[np.ndarray, " n"]:
+def seat_layer(surface: Grids) -> Values:
     """The layer of the seat's upper face: the median of the highest voxels of the middle columns.
 
     NaN where nothing covers the middle.
@@ -224,7 +193,7 @@ def seat_layer(surface: Bool[np.ndarray, "n x y z"]) -> Float[np.ndarray, " n"]:
     return np.where(layer > 0, layer, np.nan)
 
 
-def grid_statistics(seats: Seats) -> dict[str, Float[np.ndarray, " n"]]:
+def grid_statistics(seats: Seats) -> dict[str, Values]:
     """Statistics of each seat; NaN if undefined, such as the thickness of a missing back."""
     surface, seat = seats.surface, seat_layer(seats.surface)
     above = surface & (Y > seat[:, None, None, None] + 2)
@@ -244,7 +213,7 @@ def grid_statistics(seats: Seats) -> dict[str, Float[np.ndarray, " n"]]:
     }
 
 
-def _filled_rows(outline: Bool[np.ndarray, "n x y"]) -> Float[np.ndarray, " n"]:
+def _filled_rows(outline: Bool[np.ndarray, "n x y"]) -> Values:
     """Filled share of an outline between the first and the last voxel of each row."""
     between = _until(outline, 1) & _until(outline[:, ::-1], 1)[:, ::-1]
     return outline.sum((1, 2)) / np.maximum(between.sum((1, 2)), 1)
@@ -254,7 +223,7 @@ def _until(occupied: np.ndarray, axis: int) -> np.ndarray:
     return np.maximum.accumulate(occupied, axis=axis)
 
 
-def enclosed(surface: Bool[np.ndarray, "n x y z"]) -> Bool[np.ndarray, "n x y z"]:
+def enclosed(surface: Grids) -> Grids:
     """Voxels between surfaces along all three axes."""
     inside = np.ones_like(surface)
     for axis in (1, 2, 3):
@@ -262,17 +231,13 @@ def enclosed(surface: Bool[np.ndarray, "n x y z"]) -> Bool[np.ndarray, "n x y z"
     return inside
 
 
-def back_of(
-    surface: Bool[np.ndarray, "n x y z"], seat: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def back_of(surface: Grids, seat: Values) -> Bool[np.ndarray, " n"]:
     """Whether voxels lie well above the seat, in the rear half, in most of the middle columns."""
     behind = (surface & (Y > seat[:, None, None, None] + 4))[:, 8:24, :, REAR]
     return behind.any(axis=(2, 3)).mean(axis=1) >= 0.5
 
 
-def arms_of(
-    surface: Bool[np.ndarray, "n x y z"], seat: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def arms_of(surface: Grids, seat: Values) -> Bool[np.ndarray, " n"]:
     """Whether both sides have voxels over a length of five, above the seat, before the back."""
     over = Y - seat[:, None, None, None]
     beside = surface & (over > 2) & (over < 13) & (Z >= 12) & (Z < 28)
@@ -284,13 +249,11 @@ def parts(seats: Seats) -> dict[str, Bool[np.ndarray, " n"]]:
     """The parts that each seat has."""
     surface, seat = seats.surface, seat_layer(seats.surface)
     pieces = np.array([components(one)[1] for one in surface])
+    feet = ("one foot", "two feet", "three feet", "four feet")
     return {
         "back": back_of(surface, seat),
         "arms": arms_of(surface, seat),
-        "one foot": pieces == 1,
-        "two feet": pieces == 2,
-        "three feet": pieces == 3,
-        "four feet": pieces == 4,
+        **{name: pieces == i for i, name in enumerate(feet, start=1)},
         "more feet": pieces > 4,
         "voluminous": enclosed(surface).mean((1, 2, 3)) > VOLUMINOUS,
     }
@@ -304,12 +267,8 @@ VOLUMINOUS = 0.4
 
 
 def nearest(
-    these: Bool[np.ndarray, "n x y z"],
-    those: Bool[np.ndarray, "m x y z"],
-    *,
-    same: bool = False,
-    block: int = 512,
-) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    these: Grids, those: Bool[np.ndarray, "m x y z"], *, same: bool = False, block: int = 512
+) -> tuple[Values, Int[np.ndarray, " n"]]:
     """The highest IoU of each grid with any of the others, and the index of that other grid.
 
     With `same`, the first grids are part of the second ones, and no grid is compared with itself.
@@ -329,7 +288,7 @@ def nearest(
     return np.concatenate(best), np.concatenate(which)
 
 
-def spread(values: Float[np.ndarray, " n"]) -> dict[str, float]:
+def spread(values: Values) -> dict[str, float]:
     """Mean and quantiles of the values that are not NaN."""
     known = values[~np.isnan(values)]
     if not len(known):
@@ -339,7 +298,7 @@ def spread(values: Float[np.ndarray, " n"]) -> dict[str, float]:
     return {"mean": _round(known.mean())} | {f"{q} %": _round(v) for q, v in quantiles}
 
 
-def compare(ours: Float[np.ndarray, " n"], real: Float[np.ndarray, " m"]) -> dict[str, float]:
+def compare(ours: Values, real: Float[np.ndarray, " m"]) -> dict[str, float]:
     """Coverage of one distribution by another.
 
     `covered`: share of the real values between our 1st and 99th percentile. `KS`: largest gap
@@ -365,18 +324,46 @@ def _round(value: Any) -> float:
 
 # ------------------------------------------------------------------ the experiment
 
+Numbers = Mapping[str, Mapping[str, Values]]
+"""Statistics of the seats of each source."""
 
-def run(config: Config) -> tuple[dict[str, Any], dict[str, Seats], dict[str, np.ndarray]]:
-    """The results, the sources, and the nearest-neighbour IoU by comparison."""
-    chairs = 20 if config.smoke else config.chairs
-    sources = read_sources(config, chairs)
-    ious, worst = nearest_neighbours(sources, chairs)
-    ours, *real = sources
+
+def main(config: Config) -> dict[str, Any] | None:
+    """Compare the sources, and write the results and the figure."""
+    config = config.reduced(chairs=20)
+    if config.write_boxes:
+        return write_box_chairs(config)
+    start = time.perf_counter()
+    sources = read_sources(config)
+    ious, worst = nearest_neighbours(sources, config.chairs)
     numbers = {name: grid_statistics(seats) for name, seats in sources.items()}
-    shares = {name: parts(seats) for name, seats in sources.items()}
     results = {
         "seats": {name: len(seats.names) for name, seats in sources.items()},
         "nearest neighbour IoU": {name: spread(iou) for name, iou in ious.items()},
+        **compared(sources, numbers),
+        "worst covered CAD seats": worst,
+        "config": {"chairs": str(config.chairs), "smoke": str(config.smoke)},
+        "seconds": round(time.perf_counter() - start),
+    }
+    write_json(config.results / "procedural_vs_real.json", results)
+    plot(config.results / "procedural_vs_real.png", results, sources, numbers, ious)
+    print(json.dumps(results["nearest neighbour IoU"], indent=1))
+    return results
+
+
+def read_sources(config: Config) -> dict[str, Seats]:
+    wanted = {"procedural": procedural_chairs(config.chairs), "CAD": cad_seats(config.cad)}
+    if config.boxes:
+        wanted["boxes"] = box_chairs(config.boxes, 2 * config.chairs if config.smoke else None)
+    return {name: measure(source, name) for name, source in wanted.items()}
+
+
+def compared(sources: Mapping[str, Seats], numbers: Numbers) -> dict[str, Any]:
+    """Statistics and parts of each source; how well the procedural chairs cover the others."""
+    ours, *real = sources
+    shares = {name: parts(seats) for name, seats in sources.items()}
+    mean = {name: seats.surface.mean(0) for name, seats in sources.items()}
+    return {
         "statistics": {
             statistic: {name: spread(numbers[name][statistic]) for name in sources}
             | {f"{ours} and {r}": compare(values, numbers[r][statistic]) for r in real}
@@ -387,67 +374,46 @@ def run(config: Config) -> tuple[dict[str, Any], dict[str, Seats], dict[str, np.
             for part in shares[ours]
         },
         "mean grids, mean absolute difference": {
-            f"{ours} and {r}": _round(
-                np.abs(sources[ours].surface.mean(0) - sources[r].surface.mean(0)).mean()
-            )
-            for r in real
+            f"{ours} and {r}": _round(np.abs(mean[ours] - mean[r]).mean()) for r in real
         },
-        "worst covered CAD seats": worst,
-        "config": {k: str(v) for k, v in asdict(config).items() if k in ("chairs", "smoke")},
-    }
-    return results, sources, ious
-
-
-def read_sources(config: Config, chairs: int) -> dict[str, Seats]:
-    family = Path(jaxshape.data.chairs.__file__).parent
-    wanted = {
-        "procedural": (procedural_chairs(chairs), fingerprint(family), chairs),
-        "CAD": (cad_seats(config.cad), fingerprint(config.cad), None),
-    }
-    if config.boxes:
-        count = 2 * chairs if config.smoke else None
-        wanted["boxes"] = (box_chairs(config.boxes, count), fingerprint(config.boxes), count)
-    return {
-        name: cached(config.cache / f"{name}-{total or 'all'}-{digest}.npz", source, total)
-        for name, (source, digest, total) in wanted.items()
     }
 
 
 def nearest_neighbours(
-    sources: dict[str, Seats], chairs: int
+    sources: Mapping[str, Seats], chairs: int
 ) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """Coverage, realism and their yardsticks; and the ten CAD seats that are covered worst.
 
     Box chairs are split in two: as many as there are procedural chairs take their place in one
     comparison, and the others have to be covered, so that both families have the same chance.
     """
-    ours, cad = sources["procedural"], sources["CAD"]
-    ious, which = {}, {}
-
-    def add(name: str, these: np.ndarray, those: np.ndarray, same: bool = False) -> None:
-        ious[name], which[name] = nearest(these, those, same=same)
-
-    add("CAD to procedural", cad.surface, ours.surface)
-    add("CAD to other CAD", cad.surface, cad.surface, same=True)
+    ours, cad = sources["procedural"].surface, sources["CAD"].surface
+    pairs = {
+        "CAD to procedural": (cad, ours, False),
+        "CAD to other CAD": (cad, cad, True),
+    }
     if "boxes" in sources:
         known, held_out = np.split(sources["boxes"].surface, [chairs])
-        add("CAD to boxes", cad.surface, known)
-        add("boxes held out to procedural", held_out, ours.surface)
-        add("boxes held out to other boxes", held_out, known)
-        add("procedural to boxes", ours.surface, known)
-    add("procedural to other procedural", ours.surface[: chairs // 4], ours.surface, same=True)
-    add("procedural to CAD", ours.surface, cad.surface)
-    covered = ious["CAD to procedural"]
-    worst = [
-        {
-            "seat": cad.names[i],
-            "IoU": _round(covered[i]),
-            "nearest": ours.names[which["CAD to procedural"][i]],
+        pairs |= {
+            "CAD to boxes": (cad, known, False),
+            "boxes held out to procedural": (held_out, ours, False),
+            "boxes held out to other boxes": (held_out, known, False),
+            "procedural to boxes": (ours, known, False),
         }
-        | ({"IoU with boxes": _round(ious["CAD to boxes"][i])} if "boxes" in sources else {})
-        for i in np.argsort(covered)[:10]
-    ]
-    return ious, worst
+    pairs |= {
+        "procedural to other procedural": (ours[: chairs // 4], ours, True),
+        "procedural to CAD": (ours, cad, False),
+    }
+    found = {name: nearest(a, b, same=same) for name, (a, b, same) in pairs.items()}
+    covered, which = found["CAD to procedural"]
+    worst = []
+    for i in np.argsort(covered)[:10]:
+        seat = {"seat": sources["CAD"].names[i], "IoU": _round(covered[i])}
+        seat["nearest"] = sources["procedural"].names[which[i]]
+        if "boxes" in sources:
+            seat["IoU with boxes"] = _round(found["CAD to boxes"][0][i])
+        worst.append(seat)
+    return {name: iou for name, (iou, _) in found.items()}, worst
 
 
 # ------------------------------------------------------------------ the figure
@@ -456,7 +422,11 @@ STYLE = {"procedural": (ORANGE, "-"), "CAD": (BLUE, "--"), "boxes": (GREEN, "-."
 
 
 def plot(
-    path: Path, results: dict[str, Any], sources: dict[str, Seats], ious: dict[str, np.ndarray]
+    path: Path,
+    results: dict[str, Any],
+    sources: Mapping[str, Seats],
+    numbers: Numbers,
+    ious: Mapping[str, np.ndarray],
 ) -> None:
     def draw(figure: Any) -> None:
         upper, lower = figure.subfigures(2, 1, height_ratios=[1, 1.2], hspace=0.02)
@@ -465,12 +435,12 @@ def plot(
         dots, curves = right.subplots(2, 1, height_ratios=[1, 1.4])
         _plot_parts(dots, results)
         _plot_nearest(curves, ious)
-        _plot_statistics(lower, results, sources)
+        _plot_statistics(lower, results, numbers)
 
     save_figure(path, (10.0, 12.0), draw, font=9.0)
 
 
-def _plot_projections(figure: Any, sources: dict[str, Seats]) -> None:
+def _plot_projections(figure: Any, sources: Mapping[str, Seats]) -> None:
     """Frequency of occupied voxels, as the mean along each axis."""
     views = {"from the front": 0, "from the right": 1, "from above": 2}
     axes = figure.subplots(len(sources), 3, squeeze=False)
@@ -501,7 +471,7 @@ def _plot_parts(ax: Any, results: dict[str, Any]) -> None:
     ax.legend(frameon=False)
 
 
-def _plot_nearest(ax: Any, ious: dict[str, np.ndarray]) -> None:
+def _plot_nearest(ax: Any, ious: Mapping[str, np.ndarray]) -> None:
     """Colours show the seats that search for a neighbour, lines the seats to choose from."""
     for name, iou in ious.items():
         these, those = name.split(" to ")
@@ -515,13 +485,12 @@ def _plot_nearest(ax: Any, ious: dict[str, np.ndarray]) -> None:
     _tidy(ax)
 
 
-def _plot_statistics(figure: Any, results: dict[str, Any], sources: dict[str, Seats]) -> None:
-    numbers = {name: grid_statistics(seats) for name, seats in sources.items()}
+def _plot_statistics(figure: Any, results: dict[str, Any], numbers: Numbers) -> None:
     axes = figure.subplots(3, 3)
     for ax, statistic in zip(axes.flat, numbers["procedural"], strict=True):
-        everything = np.concatenate([numbers[name][statistic] for name in sources])
-        for name in sources:
-            _cumulative(ax, numbers[name][statistic], *STYLE[name], name)
+        everything = np.concatenate([found[statistic] for found in numbers.values()])
+        for name, found in numbers.items():
+            _cumulative(ax, found[statistic], *STYLE[name], name)
         if "thickness" in statistic:
             ax.set_xscale("log")
         if np.isfinite(everything).any():
@@ -563,18 +532,6 @@ def write_box_chairs(config: Config) -> None:
     config.write_boxes.mkdir(parents=True, exist_ok=True)
     for name, mesh in box_chairs(config.boxes, config.chairs):
         mesh.export(config.write_boxes / f"box-chair-{name}.ply")
-
-
-def main(config: Config) -> dict[str, Any] | None:
-    if config.write_boxes:
-        return write_box_chairs(config)
-    start = time.perf_counter()
-    results, sources, ious = run(config)
-    results["seconds"] = round(time.perf_counter() - start)
-    write_json(config.output, results)
-    plot(config.output.with_suffix(".png"), results, sources, ious)
-    print(json.dumps(results["nearest neighbour IoU"], indent=1))
-    return results
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def table(size=(0.5, 0.9, 0.5), *, back=False, arms=False, leg=0.05):
 
 def measured(*meshes):
     source = [(str(i), mesh) for i, mesh in enumerate(meshes)]
-    return experiment.measure(iter(source), len(source), "test")
+    return experiment.measure(source, "test")
 
 
 def test_statistics_of_a_chair_of_known_sizes():
@@ -92,14 +92,13 @@ def test_smoke(tmp_path, with_boxes):
     config = experiment.Config(
         cad=tmp_path / "cad",
         boxes=tmp_path / "boxes.npz" if with_boxes else None,
-        cache=tmp_path / "cache",
-        output=tmp_path / "results.json",
+        results=tmp_path,
         smoke=True,
     )
     first = experiment.main(config)
-    assert json.loads(config.output.read_text()) == first
-    assert is_drawn(config.output.with_suffix(".png"))
+    assert json.loads((tmp_path / "procedural_vs_real.json").read_text()) == first
+    assert is_drawn(tmp_path / "procedural_vs_real.png")
     assert first["seats"] == {"procedural": 20, "CAD": 3} | ({"boxes": 25} if with_boxes else {})
     assert len(first["worst covered CAD seats"]) == 3
-    again = experiment.main(config)  # from the cache
+    again = experiment.main(config)
     assert {**again, "seconds": 0} == {**first, "seconds": 0}
