@@ -11,6 +11,7 @@ measurement of four frames, the encoder's shape, and the shape that CMA-ES finds
 picture, with the IoUs under it; about a minute on two cores, most of it compiling.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,9 +23,9 @@ import numpy as np
 import trimesh
 import tyro
 from jaxtyping import Float, Int
-from matplotlib.figure import Figure
 from rich.progress import track
 
+from figures import drawn
 from jaxshape.data import meshes
 from jaxshape.data.split import hold_out
 from jaxshape.data.survey import survey
@@ -194,16 +195,15 @@ def plot(config: Config, prior: ShapePrior, rows: int = 4) -> None:
         draw(model.mesh, *jax.device_get(jax.tree.map(lambda x, i=i: x[i], (cases, found))))
         for i, model in enumerate(track(models, "pictures"))
     ]
-    figure = Figure(figsize=(2.2 * len(pictures[0]), 2.4 * len(pictures)), layout="constrained")
-    axes = figure.subplots(len(pictures), len(pictures[0]), squeeze=False)
-    for axis, panel in zip(axes.flat, (panel for row in pictures for panel in row), strict=True):
-        axis.imshow(panel.image)
-        axis.set_axis_off()
-        axis.text(0.5, -0.02, panel.note, ha="center", va="top", transform=axis.transAxes)
-    for axis, panel in zip(axes[0], pictures[0], strict=True):
-        axis.set_title(panel.title, weight="bold")
-    with atomic_path(config.picture) as path:
-        figure.savefig(path, dpi=100)
+    columns = len(pictures[0])
+    with drawn(config.picture, 2.2 * columns, 2.4 * len(pictures), dpi=100) as figure:
+        axes = figure.subplots(len(pictures), columns, squeeze=False)
+        for axis, panel in zip(axes.flat, itertools.chain(*pictures), strict=True):
+            axis.imshow(panel.image)
+            axis.set_axis_off()
+            axis.text(0.5, -0.02, panel.note, ha="center", va="top", transform=axis.transAxes)
+        for axis, panel in zip(axes[0], pictures[0], strict=True):
+            axis.set_title(panel.title, weight="bold")
 
 
 def main(config: Config) -> list[str]:
