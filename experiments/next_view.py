@@ -14,7 +14,7 @@ Time: 40 minutes on two cores.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,8 +25,8 @@ import jaxlie
 import numpy as np
 import tyro
 
+import runs
 from figures import COLUMN, draw_mean, interval, save_column
-from jaxshape.data.archives import list_meshes
 from jaxshape.data.capture import camera_distance, capture, fused_frames, sensor_of
 from jaxshape.data.dataset import hash_seed, load_object
 from jaxshape.data.meshes import Skipped
@@ -46,7 +46,6 @@ from jaxshape.results.journal import Journal
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct_jit
 
-RESULTS = Path(__file__).parent / "results"
 KINECT = CAMERAS["kinect"]
 SENSOR = sensor_of(KINECT)
 LINES: dict[str, dict[str, Any]] = {
@@ -59,22 +58,15 @@ ELEVATION, STEP = 30.0, 45.0
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.SeatsConfig):
     """Settings of the experiment."""
 
-    meshes: Path = Path("cad_chairs")
-    """Folder of the CAD seats, as experiments/cad_seats.py writes it."""
-    seats: int = 78
-    """Number of seats, spread over all seats."""
     views: int = 6
     """Number of views of each seat, 2 or more."""
     samples: int = 16
     """Number of sampled shapes from which views are chosen, 1 to 32."""
     at_a_time: int = 6
     """Number of seats that are rebuilt in one call."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """A test run with one seat and two views."""
 
 
 class Seat(NamedTuple):
@@ -91,20 +83,17 @@ class Seat(NamedTuple):
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        config = replace(config, seats=1, views=2, samples=4, at_a_time=1)
-    journal = run(config)
-    plot(journal, config.results / "next_view.png")
+    config = config.reduced(seats=1, views=2, samples=4, at_a_time=1)
+    plot(run(config), config.results / "next_view.png")
 
 
 def run(config: Config) -> Journal:
     """Choose views and rebuild after each, a few seats at a time."""
     prior = load_prior()
-    settings = {"views": config.views, "samples": config.samples, "weights": fingerprint(prior)}
-    journal = Journal(config.results / "next_view.json", settings)
-    sources = list_meshes(config.meshes)
-    chosen = [sources[i * len(sources) // config.seats] for i in range(config.seats)]
-    missing = [one for one in chosen if one.name not in journal.rows]
+    journal = config.journal(
+        "next_view", views=config.views, samples=config.samples, weights=fingerprint(prior)
+    )
+    missing = [one for one in config.chosen() if one.name not in journal.rows]
     for start in range(0, len(missing), config.at_a_time):
         began = time.perf_counter()
         seats = [_seat(one) for one in missing[start : start + config.at_a_time]]
