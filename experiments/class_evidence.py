@@ -12,7 +12,8 @@ object; a killed run resumes.
 
 import json
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+import runs
 from jaxshape.data.capture import camera_distance, capture, fused_frames, sensor_of
 from jaxshape.data.families import FAMILIES, TEST_SEEDS
 from jaxshape.data.virtual_cameras import VirtualCamera
-from jaxshape.files import write_json
 from jaxshape.geometry import camera
 from jaxshape.geometry.fusing import fusion_named
 from jaxshape.geometry.grids import Grids
@@ -32,52 +33,39 @@ from jaxshape.mapping.scene.evidence import Predicted, predict_hidden
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
-from runs import earlier
+from jaxshape.results.journal import Journal
 from things import KINDS, thing
 
-RESULTS = Path(__file__).parent / "results"
 CAMERA = VirtualCamera(320, 240, 62.7, 1.8)
 FRAMES = 6
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
     """Settings of the experiment."""
 
     count: int = 40
     """Number of objects of each family; of objects of neither class there are twice as many."""
     tables: Path | None = None
     """Weights for tables; None uses the class of chairs alone."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """A test run with one object of each family."""
 
 
 def main(config: Config) -> None:
     prepare_process()
-    if config.smoke:
-        config = replace(config, count=1)
-    print(json.dumps(run(config)["confusion"], indent=1))
+    print(json.dumps(confusion(run(config.reduced(count=1)).rows), indent=1))
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: Config) -> Journal:
     """Score all objects, going on from earlier results of the same settings."""
-    path = config.results / "class_evidence.json"
-    settings = {"count": config.count, "tables": config.tables is not None}
-    done = earlier(path, settings, "objects")
+    tables = config.tables
+    journal = config.journal("class_evidence", count=config.count, tables=tables is not None)
     priors = {"chair": load_prior("chair")}
-    if config.tables is not None:
-        priors["table"] = load_prior(config.tables)
-    for kind, seed in objects(config.count):
-        name = f"{kind}-{seed}"
-        if name not in done:
-            done[name] = {"kind": kind, **scored(priors, seen(kind, seed))}
-            write_json(path, _content(settings, done))
-    return _content(settings, done)
-
-
-def _content(settings: dict[str, Any], done: dict[str, Any]) -> dict[str, Any]:
-    return {"settings": settings, "confusion": confusion(done), "objects": done}
+    if tables is not None:
+        priors["table"] = load_prior(tables)
+    tasks = {f"{kind}-{seed}": partial(scored, priors, kind, seed)
+             for kind, seed in objects(config.count)}  # fmt: skip
+    runs.complete(journal, tasks, confusion, lambda one: str(one["class"]))
+    return journal
 
 
 def objects(count: int) -> list[tuple[str, int]]:
@@ -107,12 +95,14 @@ def seen(kind: str, seed: int) -> Grids:
     return Grids(grids.occupied[None], grids.occluded[None])
 
 
-def scored(priors: dict[str, ShapePrior], grids: Grids) -> dict[str, Any]:
-    """The scores of the priors' predictions, and the decision."""
+def scored(priors: dict[str, ShapePrior], kind: str, seed: int) -> dict[str, Any]:
+    """The scores of the priors' predictions for an object, and the decision."""
+    grids = seen(kind, seed)
     found = {name: predict_hidden(prior, grids) for name, prior in priors.items()}
     one = {name: Predicted(*(np.asarray(x)[0] for x in of)) for name, of in found.items()}
     decision = decided(one)
     return {
+        "kind": kind,
         "class": decision.name,
         "quarters": decision.quarters,
         "sure": round(decision.sure, 3),
@@ -122,9 +112,9 @@ def scored(priors: dict[str, ShapePrior], grids: Grids) -> dict[str, Any]:
     }
 
 
-def confusion(done: dict[str, Any]) -> dict[str, dict[str, int]]:
+def confusion(done: dict[str, Any]) -> dict[str, Any]:
     """Number of objects of each kind by decided class, and of chairs with the right front."""
-    table: dict[str, dict[str, int]] = {}
+    table = {}
     for kind in ("chair", "table", *KINDS):
         those = [one for one in done.values() if one["kind"] == kind]
         counts = Counter(str(one["class"]) for one in those)
@@ -132,7 +122,7 @@ def confusion(done: dict[str, Any]) -> dict[str, dict[str, int]]:
         if kind == "chair":
             right = [one for one in those if one["class"] == kind and one["quarters"] == 0]
             table[kind]["front right"] = len(right)
-    return table
+    return {"confusion": table}
 
 
 if __name__ == "__main__":

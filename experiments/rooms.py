@@ -13,7 +13,8 @@ Results: experiments/results/rooms.json, room by room, and rooms.png: a killed r
 import json
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,13 +23,13 @@ import numpy as np
 import trimesh
 import tyro
 
-from filming import film, look_from
+import runs
+from filming import among_boxes, film, look_from
 from jaxshape.data.boxes import Box, in_object
 from jaxshape.data.capture import SURFACE_SAMPLES, discretize
 from jaxshape.data.families import FAMILIES, TEST_SEEDS
 from jaxshape.data.meshes import sample_surface
 from jaxshape.data.sequences import open_sequence
-from jaxshape.files import write_json
 from jaxshape.geometry import grid
 from jaxshape.geometry.overlap import iou
 from jaxshape.mapping.scene.classes import SceneClasses, build_classes
@@ -37,28 +38,24 @@ from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
 from jaxshape.report.figures import save_figure
 from jaxshape.report.palette import CYCLE
+from jaxshape.results.journal import Journal
 from jaxshape.results.output import only, shape_mesh
 from jaxshape.results.progress import observation_of
-from runs import earlier
 from things import KINDS, thing
 
-RESULTS = Path(__file__).parent / "results"
 SHAPE, FOCAL = (240, 320), 262.5
 FOUND = 0.25
 """Least overlap of its box with the true box for an object to be found."""
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
     """Settings of the experiment."""
 
     rooms: int = 24
     frames: int = 16
     tables: Path | None = None
     """Weights for tables; None uses the class of chairs alone."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """A test run with one room and few frames."""
 
 
 class Placed(NamedTuple):
@@ -72,33 +69,23 @@ class Placed(NamedTuple):
 
 def main(config: Config) -> None:
     prepare_process()
-    if config.smoke:
-        config = replace(config, rooms=1, frames=4)
-    results = run(config)
-    print(json.dumps(results["summary"], indent=1))
+    config = config.reduced(rooms=1, frames=4)
+    journal = run(config)
+    draw(journal.rows, config.results / "rooms.png")
+    print(json.dumps(summary(journal.rows), indent=1))
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: Config) -> Journal:
     """Rebuild every room, going on from earlier results of the same settings."""
-    path = config.results / "rooms.json"
-    settings = {"frames": config.frames, "tables": config.tables is not None}
-    done = earlier(path, settings, "rooms")
-    classes = classes_of(config.tables)
-    for number in range(config.rooms):
-        if str(number) not in done:
-            done[str(number)] = one_room(number, config.frames, classes)
-            content = {"settings": settings, "summary": summary(done), "rooms": done}
-            write_json(path, content)
-            draw(done, config.results / "rooms.png")
-            print(number, json.dumps(done[str(number)]), flush=True)
-    return {"settings": settings, "summary": summary(done), "rooms": done}
-
-
-def classes_of(tables: Path | None) -> SceneClasses:
+    tables = config.tables
+    journal = config.journal("rooms", frames=config.frames, tables=tables is not None)
     priors = {"chair": load_prior("chair")}
     if tables is not None:
         priors["table"] = load_prior(tables)
-    return build_classes(priors, placers={"chair": load_prior("chair-autoencoder")})
+    classes = build_classes(priors, placers={"chair": load_prior("chair-autoencoder")})
+    tasks = {str(i): partial(one_room, i, config.frames, classes) for i in range(config.rooms)}
+    runs.complete(journal, tasks, summary, json.dumps)
+    return journal
 
 
 # One room ---------------------------------------------------------------------------------------
@@ -170,19 +157,12 @@ def record(folder: Path, truth: list[Placed], frames: int, seed: int) -> None:
     """Film a room by hand, with poses that err a little."""
     rng = np.random.default_rng([seed, 1])
     meshes = [one.mesh.copy().apply_transform(one.T_world_object) for one in truth]
-    whole = trimesh.util.concatenate(meshes)
-    behind = whole.bounds[0, 2] - 0.4
-    room = [
-        trimesh.creation.box(bounds=np.array(corners, float))
-        for corners in (
-            ((-5, -0.1, -5), (5, 0, 5)),
-            ((-5, 0, behind - 0.1), (5, 2.5, behind)),
-        )
-    ]
-    T = path(whole.bounds, frames, rng)
+    bounds = among_boxes(meshes, []).bounds
+    behind = bounds[0, 2] - 0.4
+    floor, wall = ((-5, -0.1, -5), (5, 0, 5)), ((-5, 0, behind - 0.1), (5, 2.5, behind))
+    T = path(bounds, frames, rng)
     written = np.array([_shaken(one, rng) for one in T])
-    together: Any = trimesh.util.concatenate([*meshes, *room])
-    film(folder, together, T, SHAPE, FOCAL, rng, written)
+    film(folder, among_boxes(meshes, [floor, wall]), T, SHAPE, FOCAL, rng, written)
 
 
 def path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarray:
@@ -214,20 +194,17 @@ def _shaken(T: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def matched(truth: list[Placed], scene: Scene) -> dict[int, SceneObject]:
-    """The found object of each true object."""
-    pairs = sorted(
-        (
-            (-box_overlap(_box(one), found.progress.start.box), i, k)
-            for i, one in enumerate(truth)
-            for k, found in enumerate(scene.objects)
-        ),
-    )
-    matches, taken = {}, set()
-    for overlap, i, k in pairs:
-        if -overlap > FOUND and i not in matches and k not in taken:
-            matches[i] = scene.objects[k]
-            taken.add(k)
-    return matches
+    """The found object of each true object: pairs by their overlap, the largest first."""
+    overlaps = {
+        (i, k): box_overlap(_box(one), found.progress.start.box)
+        for i, one in enumerate(truth)
+        for k, found in enumerate(scene.objects)
+    }
+    matches: dict[int, int] = {}
+    for i, k in sorted(overlaps, key=lambda pair: (-overlaps[pair], pair)):
+        if overlaps[i, k] > FOUND and i not in matches and k not in matches.values():
+            matches[i] = k
+    return {i: scene.objects[k] for i, k in matches.items()}
 
 
 def _box(one: Placed) -> Box:
@@ -289,30 +266,33 @@ def mesh_iou(one: Placed, found: SceneObject) -> float:
 def summary(rooms: dict[str, Any]) -> dict[str, Any]:
     """Means over all rooms, by class; yaw errors of tables are modulo half a turn."""
     objects = [one for room in rooms.values() for one in room["objects"]]
-    figures: dict[str, Any] = {"rooms": len(rooms), "objects": len(objects)}
-    figures["false objects"] = sum(len(room["false"]) for room in rooms.values())
-    figures["false objects of a class"] = sum(
-        one["class"] is not None for room in rooms.values() for one in room["false"]
-    )
+    false = [one for room in rooms.values() for one in room["false"]]
+    figures: dict[str, Any] = {
+        "rooms": len(rooms),
+        "objects": len(objects),
+        "false objects": len(false),
+        "false objects of a class": sum(one["class"] is not None for one in false),
+    }
     for kind in ("chair", "table", "neither"):
-        those = [
-            one
-            for one in objects
-            if (one["kind"] if one["kind"] in FAMILIES else "neither") == kind
-        ]
+        those = [one for one in objects if kind_of(one) == kind]
         found = [one for one in those if one["found"]]
         figures[kind] = {"objects": len(those), "found": len(found)}
         for name in ("chair", "table", None):
             figures[kind][f"classed {name}"] = sum(one.get("class") == name for one in found)
-        right = [one for one in found if one.get("class") == (None if kind == "neither" else kind)]
+        right = [one for one in found if (one.get("class") or "neither") == kind]
         if right:
             figures[kind] |= _errors(kind, right)
+    times = {n: [room["cpu_seconds"] for room in rooms.values() if len(room["objects"]) == n]
+             for n in range(3, 7)}  # fmt: skip
     figures["seconds by objects"] = {
-        str(n): round(float(np.median(those)), 1)
-        for n in range(3, 7)
-        if (those := [r["cpu_seconds"] for r in rooms.values() if len(r["objects"]) == n])
+        str(n): round(float(np.median(those)), 1) for n, those in times.items() if those
     }
-    return figures
+    return {"summary": figures}
+
+
+def kind_of(one: dict[str, Any]) -> str:
+    """The class of a true object, or `neither`."""
+    return one["kind"] if one["kind"] in FAMILIES else "neither"
 
 
 def _errors(kind: str, right: list[dict[str, Any]]) -> dict[str, float]:

@@ -43,7 +43,7 @@ def test_a_summary_counts_what_is_found_classed_and_wrong():
         "false": [{"class": "chair"}],
         "cpu_seconds": 2.0,
     }
-    found = summary({"0": room})
+    found = summary({"0": room})["summary"]
     assert found["chair"]["classed chair"] == 1 and found["chair"]["yaw median"] == 10
     assert found["neither"]["classed None"] == 1 and found["table"]["found"] == 0
     assert found["false objects of a class"] == 1
@@ -55,6 +55,6 @@ def test_the_confusion_table_counts_classes_and_fronts():
         "b": {"kind": "chair", "class": "chair", "quarters": 2},
         "c": {"kind": "plant", "class": None, "quarters": 0},
     }
-    table = confusion(done)
+    table = confusion(done)["confusion"]
     assert table["chair"] == {"objects": 2, "chair": 2, "front right": 1}
     assert table["plant"] == {"objects": 1, "None": 1}
