@@ -13,7 +13,8 @@ Results: experiments/results/hand_held.json, seat by seat: a killed run resumes.
 
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,22 +24,21 @@ import numpy as np
 import trimesh
 import tyro
 
-from filming import film, look_from
+import runs
+from filming import among_boxes, film, look_from
 from jaxshape.data import meshes
 from jaxshape.data.boxes import Box
 from jaxshape.data.render import render_depth
 from jaxshape.data.sequences import open_sequence
-from jaxshape.files import write_json
 from jaxshape.geometry.camera import Intrinsics
 from jaxshape.mapping.map.mapper import Mapper
 from jaxshape.mapping.placement.finding import find_start
 from jaxshape.mapping.segmentation.segment import Prompt
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.process import prepare_process
+from jaxshape.results.journal import Journal
 from rebuilding import judgement, meshed, middle_pixel, rebuilt, usual
-from runs import earlier, spread
 
-RESULTS = Path(__file__).parent / "results"
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 NEAR = 0.04
 """Largest error of a side of the box that counts as right, in metres."""
@@ -46,63 +46,50 @@ T_WORLD_OBJECT = np.array([[0, 0, 1, 2], [0, 1, 0, 1], [-1, 0, 0, -3], [0, 0, 0,
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.SeatsConfig):
     """Settings of the experiment."""
 
-    meshes: Path = Path("cad_chairs")
-    """Folder or archive of seats, +y up and +z in front."""
     seats: int = 24
     """Number of seats, spread over all seats."""
     frames: int = 12
-    results: Path = RESULTS
-    smoke: bool = False
-    """A test run with one seat and few frames."""
 
 
 def main(config: Config) -> None:
     prepare_process()
-    if config.smoke:
-        config = replace(config, seats=1, frames=3)
-    metrics = run(config)
-    for name, one in metrics["seats"].items():
-        print(name[:40].ljust(40), _row(one))
-    print(metrics["summary"])
+    print(summary(run(config.reduced(seats=1, frames=3)).rows)["summary"])
 
 
-def _row(one: dict[str, Any]) -> str:
+def run(config: Config) -> Journal:
+    """Rebuild every seat, going on from earlier results of the same settings."""
+    journal = config.journal(
+        "hand_held", seats=config.seats, frames=config.frames, meshes=config.meshes.name
+    )
+    placer, mapper = usual()
+    tasks = {
+        one.name: partial(_rebuilt, one, config.frames, mapper, placer) for one in config.chosen()
+    }
+    runs.complete(journal, tasks, summary, _line)
+    return journal
+
+
+def _line(one: dict[str, Any]) -> str:
     sides = " ".join(f"{100 * x:+.0f}" for x in one["sides"])
     return f"sides [{sides}] cm  {one['verdict']}, {len(one['warnings'])} warnings"
 
 
-def run(config: Config) -> dict[str, Any]:
-    """Rebuild every seat, going on from earlier results of the same settings."""
-    path = config.results / "hand_held.json"
-    settings = {"seats": config.seats, "frames": config.frames, "meshes": config.meshes.name}
-    done = earlier(path, settings, "seats")
-    placer, mapper = usual()
-    sources = meshes.list_meshes(config.meshes)
-    for source in (sources[i] for i in spread(len(sources), config.seats)):
-        if source.name not in done:
-            done[source.name] = _rebuilt(source, config.frames, mapper, placer)
-            write_json(path, {"settings": settings, "summary": summary(done), "seats": done})
-            print(source.name, _row(done[source.name]), flush=True)
-    return {"settings": settings, "summary": summary(done), "seats": done}
-
-
-def summary(seats: dict[str, Any]) -> dict[str, int]:
+def summary(seats: dict[str, Any]) -> dict[str, Any]:
     """Numbers of whole seats, and of wrong results with and without a warning."""
-    wrong = [one for one in seats.values() if np.abs(one["sides"]).max() > NEAR]
-    return {
+    good = {name for name, one in seats.items() if one["verdict"] == "good"}
+    said = {name for name, one in seats.items() if one["warnings"]}
+    wrong = {name for name, one in seats.items() if np.abs(one["sides"]).max() > NEAR}
+    counts = {
         "seats": len(seats),
         "whole": sum(_is_whole(one["sides"]) for one in seats.values()),
         "wrong": len(wrong),
-        "wrong and not said": sum(
-            not one["warnings"] and one["verdict"] == "good" for one in wrong
-        ),
-        "right and good": sum(
-            one["verdict"] == "good" for one in seats.values() if one not in wrong
-        ),
+        "wrong and not said": len(wrong & good - said),
+        "right and good": len(good - wrong),
     }
+    return {"summary": counts}
 
 
 def _is_whole(sides: list[float]) -> bool:
@@ -181,9 +168,7 @@ def _in_a_room(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
             for z in (-0.39, 0.39)
         ),
     ]
-    room = [trimesh.creation.box(bounds=np.array(corners, float)) for corners in boxes]
-    together: Any = trimesh.util.concatenate([mesh, *room])
-    return together
+    return among_boxes([mesh], boxes)
 
 
 def _path(bounds: np.ndarray, frames: int, rng: np.random.Generator) -> np.ndarray:
