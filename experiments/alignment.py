@@ -15,8 +15,7 @@ Results: experiments/results/alignment.json, of 12 seats and 4 frames, which tak
 seats take half an hour.
 """
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -26,6 +25,7 @@ import numpy as np
 import trimesh
 import tyro
 
+import runs
 from jaxshape.data import meshes
 from jaxshape.data.boxes import Box
 from jaxshape.data.render import add_sensor_noise, render_depth
@@ -39,9 +39,7 @@ from jaxshape.mapping.placement.rays import RaySamples, pooled, sample_rays
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
-from runs import spread
 
-RESULTS = Path(__file__).parent / "results"
 SHAPE, LENS = (240, 320), Intrinsics(*jnp.float32([280, 280, 160, 120]))
 DISTANCE, ELEVATION, STEP = 2.0, 25.0, 30.0
 LARGEST = 0.9
@@ -51,23 +49,15 @@ TURN, GROW, ASIDE = 15.0, 1.15, 0.03
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.SeatsConfig):
     """Settings of the experiment."""
 
-    meshes: Path = Path("cad_chairs")
-    """Folder or archive of seats, +y up and +z in front."""
-    seats: int = 78
-    """Number of seats, spread over all seats."""
     frames: tuple[int, ...] = (1, 4, 8)
-    results: Path = RESULTS
-    smoke: bool = False
-    """A test run with one seat and one frame."""
 
 
 def main(config: Config) -> None:
     prepare_process()
-    if config.smoke:
-        config = replace(config, seats=1, frames=(1,))
+    config = config.reduced(seats=1, frames=(1,))
     metrics = run(config)
     write_json(config.results / "alignment.json", metrics)
     for frames, rows in metrics["medians"].items():
@@ -77,33 +67,33 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> dict[str, Any]:
     """Align every seat with each number of frames; medians of the errors."""
-    sources = meshes.list_meshes(config.meshes)
-    chosen = spread(len(sources), config.seats)
     prior = load_prior("chair-autoencoder")
     each = {str(count): [] for count in config.frames}
-    for number in chosen:
+    sources = meshes.list_meshes(config.meshes)
+    numbers = runs.spread(len(sources), config.seats)
+    for number in numbers:
         model = meshes.load(sources[number])
         assert isinstance(model, meshes.Model), model
         mesh = _centred(model.mesh)
         for count in config.frames:
             each[str(count)].append(_align(mesh, count, prior, np.random.default_rng(number)))
-    settings = {"meshes": config.meshes.name, "seats": len(chosen), "frames": config.frames}
+    settings = {"meshes": config.meshes.name, "seats": len(numbers), "frames": config.frames}
     return {"settings": settings, "medians": {count: medians(rows) for count, rows in each.items()}}
 
 
 def medians(rows: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, float]]:
     """Medians over the seats of each error, for the start and both ways."""
-    return {
-        way: {
-            "yaw_degrees": round(float(np.median([abs(row[way]["yaw"]) for row in rows])), 2),
-            "extent_percent": round(float(np.median([row[way]["extents"] for row in rows])), 2),
-            "worst_extent_percent": round(
-                float(np.median([max(row[way]["extents"]) for row in rows])), 2
-            ),
-            "centre_cm": round(float(np.median([row[way]["centre"] for row in rows])), 2),
+
+    def of(way: str) -> dict[str, float]:
+        figures = {
+            "yaw_degrees": [abs(row[way]["yaw"]) for row in rows],
+            "extent_percent": [row[way]["extents"] for row in rows],
+            "worst_extent_percent": [max(row[way]["extents"]) for row in rows],
+            "centre_cm": [row[way]["centre"] for row in rows],
         }
-        for way in rows[0]
-    }
+        return {name: round(float(np.median(values)), 2) for name, values in figures.items()}
+
+    return {way: of(way) for way in rows[0]}
 
 
 def _centred(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
