@@ -23,7 +23,7 @@ killed training resumes from its checkpoint. Time: about an hour on two cores.
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,26 +32,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 
+import runs
+from figures import drawn, number_axis
 from jaxshape.data.config import CameraName
 from jaxshape.data.dataset import open_dataset
-from jaxshape.files import atomic_path, write_json
+from jaxshape.files import write_json
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.config import PRESETS, Architecture, Completion, TrainConfig
 from jaxshape.model.shapes import ShapePrior, decode, encode
-from jaxshape.model.training import finished_prior, train
-from jaxshape.report.figures import tidy
-from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill
+from jaxshape.results.evaluation import Case, EvaluateConfig, fill
 from jaxshape.results.metrics import occluded_scores
 from jaxshape.search.composition import complete
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 from jaxshape.search.residuals import SOFT, Residual
-from study import Subject, listed, observed, tiny
+from study import Subject, listed, observed, tiny, together, train_reporting
 
-RESULTS = Path(__file__).parent / "results"
 CASES_AT_A_TIME = 64
 
 UNET = replace(PRESETS["default"], architecture=Completion((16, 48, 64), 1), average=0.98)
@@ -80,7 +78,9 @@ COMPLETED = Residual(lambda grids, _: SOFT.target(grids, grids.data), SOFT.score
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
+    """Settings of the experiment."""
+
     dataset: Path = Path("data/chairs")
     """Folder made by `jaxshape dataset`."""
     meshes: Path | None = None
@@ -95,9 +95,6 @@ class Config:
     """Steps of Adam."""
     bfloat16: bool = False
     """Train in bfloat16, where the processor has matrix units for it."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """Tiny networks, one step, two chairs, as a test."""
 
 
 class Scores(NamedTuple):
@@ -118,12 +115,9 @@ def trained(config: Config) -> tuple[dict[str, ShapePrior], dict[str, Any]]:
     for name, settings in NETWORKS.items():
         settings = replace(settings, steps=config.steps, bfloat16=config.bfloat16)
         if config.smoke:
-            settings = replace(settings, architecture=tiny(settings.architecture), batch=2)
+            settings = tiny(settings, batch=2)
         folder = config.output / name.replace(", ", "-").replace(" ", "-")
-        for report in train(folder, dataset, settings):
-            print(f"{name}: step {report.step}, loss {report.loss:.4f}, validation "
-                  f"{report.validation_iou}", flush=True)  # fmt: skip
-        priors[name] = finished_prior(folder, dataset, settings, samples=2048)
+        priors[name] = train_reporting(name, folder, dataset, settings)
         records[name] = record_of(folder, settings, priors[name])
     return priors, records
 
@@ -144,12 +138,8 @@ def record_of(folder: Path, settings: TrainConfig, prior: ShapePrior) -> dict[st
 
 def scores_of(grids: Grids, logits, case: Case, conditional: bool, fill_logits=None) -> Scores:
     """Scores of a decoded shape, which fills hidden voxels unless other logits are given."""
-    filled = complete(
-        grids,
-        logits if fill_logits is None else fill_logits,
-        symmetry=True,
-        conditional=conditional,
-    )
+    fill_logits = logits if fill_logits is None else fill_logits
+    filled = complete(grids, fill_logits, symmetry=True, conditional=conditional)
     hidden = occluded_scores(filled.composed, filled.logits, grids.occluded, case.surface)
     return Scores(iou(logits > 0, case.surface), iou(filled.composed, case.surface), hidden.iou)
 
@@ -178,20 +168,13 @@ def contest(
     return scores
 
 
-def cases(config: Config, camera: str) -> Iterator[tuple[str, Case]]:
-    """Each chair after each number of frames; chairs without any measurement are left out."""
-    name, noise = CAMERAS[camera]
-    seen = EvaluateConfig(frames=FRAMES, camera=name, noise=noise)
+def judged(priors: Mapping[str, ShapePrior], config: Config, camera: str) -> dict[str, Any]:
+    """Mean scores by number of frames, network and stage, over the chairs that can be measured."""
+    device, noise = CAMERAS[camera]
     chairs = listed(config.meshes, config.chairs)[: config.chairs]
     subjects = [Subject(chair.name, "", chair) for chair in chairs]
-    return ((subject.name, case) for subject, case in observed(subjects, seen))
-
-
-def judged(priors: Mapping[str, ShapePrior], config: Config, camera: str) -> dict[str, Any]:
-    """Mean scores by number of frames, network and stage."""
-    names, seen = zip(*cases(config, camera), strict=True)
-    case = jax.tree.map(lambda *x: np.concatenate(x), *jax.device_get(seen))
-    keys = jnp.concatenate([case_keys(name, FRAMES) for name in names])
+    seen = observed(subjects, EvaluateConfig(frames=FRAMES, camera=device, noise=noise))
+    keys, case = together(seen, FRAMES)
     search = RefineConfig(iterations=config.iterations)
     run = jax.jit(lambda keys, priors, case: contest(keys, priors, case, search))
     batches, size = [], min(CASES_AT_A_TIME, len(keys))
@@ -202,14 +185,17 @@ def judged(priors: Mapping[str, ShapePrior], config: Config, camera: str) -> dic
         batches.append(jax.tree.map(lambda x, n=count: x[:n], found))
         print(f"{camera}: {start + count} of {len(keys)} cases", flush=True)
     scores = jax.tree.map(lambda *x: np.concatenate(x), *batches)
-    means = {}
-    for i, k in enumerate(FRAMES):
-        mean = lambda x, i=i: round(float(x[i :: len(FRAMES)].mean()), 4)  # noqa: E731
-        means[str(k)] = {
-            name: {stage: jax.tree.map(mean, one)._asdict() for stage, one in stages.items()}
-            for name, stages in scores.items()
-        }
-    return means
+    n = len(FRAMES)
+    return {
+        str(k): jax.tree.map(
+            lambda one, i=i: {
+                name: round(float(x[i::n].mean()), 4) for name, x in one._asdict().items()
+            },
+            scores,
+            is_leaf=lambda x: isinstance(x, Scores),
+        )
+        for i, k in enumerate(FRAMES)
+    }
 
 
 # ------------------------------------------------------------------ table and figure
@@ -230,46 +216,36 @@ def table(means: Mapping[str, Any]) -> str:
 
 def plot(means: Mapping[str, Any], path: Path) -> None:
     """IoU in occluded voxels by number of frames; dashed after the search."""
-    figure = Figure(figsize=(10, 3.6), layout="constrained")
-    panels = figure.subplots(1, len(means), sharey=True, squeeze=False)[0]
-    for axes, (camera, by_frames) in zip(panels, means.items(), strict=True):
-        for i, (name, stages) in enumerate(by_frames["1"].items()):
-            for stage in stages:
-                y = [by_frames[str(k)][name][stage]["occluded"] for k in FRAMES]
-                axes.plot(FRAMES, y, "--" if stage == "searched" else "-", color=f"C{i}",
-                          marker="o", ms=4, label=f"{name}, {stage}")  # fmt: skip
-        axes.set(xscale="log", xlabel="frames", title=camera)
-        axes.set_xticks(FRAMES, [str(k) for k in FRAMES])
-        axes.minorticks_off()
-        tidy(axes)
-    panels[0].set_ylabel("IoU in occluded voxels")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center",
-                  frameon=False, fontsize=7)  # fmt: skip
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150, format="png")
+    with drawn(path, 10, 3.6) as figure:
+        panels = figure.subplots(1, len(means), sharey=True, squeeze=False)[0]
+        for axes, (camera, by_frames) in zip(panels, means.items(), strict=True):
+            for i, (name, stages) in enumerate(by_frames["1"].items()):
+                for stage in stages:
+                    y = [by_frames[str(k)][name][stage]["occluded"] for k in FRAMES]
+                    line = {"color": f"C{i}", "ls": "--" if stage == "searched" else "-"}
+                    axes.plot(FRAMES, y, marker="o", ms=4, label=f"{name}, {stage}", **line)
+            number_axis(axes, FRAMES, xlabel="frames", title=camera)
+        panels[0].set_ylabel("IoU in occluded voxels")
+        curves = panels[0].get_legend_handles_labels()
+        figure.legend(*curves, loc="outside right center", frameon=False, fontsize=7)
 
 
-def main() -> None:
-    config = tyro.cli(Config)
-    if config.smoke:
-        config = replace(config, steps=1, chairs=2, iterations=2, meshes=None,
-                         results=config.output)  # fmt: skip
+def main(config: Config) -> None:
+    config = config.reduced(steps=1, chairs=2, iterations=2, meshes=None, results=config.output)
     began = time.perf_counter()
     priors, training = trained(config)
     means = {camera: judged(priors, config, camera) for camera in CAMERAS}
-    write_json(
-        config.results / "hidden_half.json",
-        {
-            "set": "procedural" if config.meshes is None else "meshes",
-            "iterations": config.iterations,
-            "seconds": round(time.perf_counter() - began),
-            "means": means,
-            "training": training,
-        },
-    )
+    results = {
+        "set": "procedural" if config.meshes is None else "meshes",
+        "iterations": config.iterations,
+        "seconds": round(time.perf_counter() - began),
+        "means": means,
+        "training": training,
+    }
+    write_json(config.results / "hidden_half.json", results)
     plot(means, config.results / "hidden_half.png")
     print(table(means))
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Config))

@@ -19,12 +19,13 @@ from rich.progress import Progress, TimeElapsedColumn
 import runs
 from figures import LINES, PAGE, draw_mean, interval, number_axis, save_column
 from jaxshape.data.archives import list_meshes
-from jaxshape.data.dataset import Object, hash_seed, load_object
+from jaxshape.data.dataset import Dataset, Object, hash_seed, load_object
 from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.data.meshes import Skipped
 from jaxshape.geometry.overlap import iou
-from jaxshape.model.config import Architecture, Completion
+from jaxshape.model.config import Completion, TrainConfig
 from jaxshape.model.shapes import ShapePrior
+from jaxshape.model.training import finished_prior, train
 from jaxshape.model.weights import fingerprint, load_prior
 from jaxshape.results.evaluation import Case, EvaluateConfig, case_keys, fill, observe
 from jaxshape.results.journal import Journal
@@ -224,12 +225,23 @@ def together(
     return keys, jax.tree.map(lambda *x: jnp.concatenate(x), *cases)
 
 
-def tiny(architecture: Architecture | Completion) -> Architecture | Completion:
-    """A network of the same kind that is trained in seconds."""
-    if isinstance(architecture, Completion):
-        return Completion((4, 4, 8), 1, 10)
-    code = min(architecture.code, 10)
-    return replace(architecture, encoder=(4, 4, 8, 8), decoder=(8, 8, 4), code=code)
+def tiny(settings: TrainConfig, batch: int) -> TrainConfig:
+    """Settings for a network of the same kind that is trained in seconds."""
+    small = settings.architecture
+    if isinstance(small, Completion):
+        small = Completion((4, 4, 8), 1, 10)
+    else:
+        code = min(small.code, 10)
+        small = replace(small, encoder=(4, 4, 8, 8), decoder=(8, 8, 4), code=code)
+    return replace(settings, architecture=small, batch=batch)
+
+
+def train_reporting(name: str, folder: Path, dataset: Dataset, settings: TrainConfig) -> ShapePrior:
+    """Train a network in a folder, or go on with it, and return it; its losses are printed."""
+    for report in train(folder, dataset, settings):
+        print(f"{name}: step {report.step}, loss {report.loss:.4f}, "
+              f"{report.samples_per_second:.0f} samples/s", flush=True)  # fmt: skip
+    return finished_prior(folder, dataset, settings, samples=2048)
 
 
 def _timed(run: Callable[..., Scores], *args: Any) -> dict[str, np.ndarray]:

@@ -32,25 +32,23 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 
+import runs
+from figures import drawn
 from jaxshape.data.archives import list_meshes
 from jaxshape.data.config import DatasetConfig, FaultConfig, InputConfig
 from jaxshape.data.dataset import Dataset, Object, hash_seed, load_object, open_dataset
 from jaxshape.data.families import TEST_SEEDS, procedural_objects
 from jaxshape.data.meshes import Model, Skipped
 from jaxshape.data.paths import draw_path
-from jaxshape.files import atomic_path, write_json
+from jaxshape.files import write_json
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.config import PRESETS, Architecture, TrainConfig
 from jaxshape.model.shapes import ShapePrior, decode, encode
-from jaxshape.model.training import finished_prior, train
 from jaxshape.report.palette import COLORS
 from jaxshape.results.evaluation import evaluate, summarize
-from study import SEARCH, SEEN, tiny
-
-RESULTS = Path(__file__).parent / "results"
+from study import SEARCH, SEEN, tiny, train_reporting
 
 SMALL = Architecture(encoder=(8, 16, 32, 64), decoder=(32, 16, 8))
 UNCHANGED = InputConfig(complete=0.0, mirror=False, warp=0.0)
@@ -102,7 +100,9 @@ GROUPS = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
+    """Settings of the experiment."""
+
     dataset: Path = Path("data/chairs")
     """Folder made by `jaxshape dataset`; half of its objects are used."""
     output: Path = Path("out/training_choices")
@@ -121,9 +121,6 @@ class Config:
     """Iterations of the searches."""
     boxes: Path | None = None
     """Folder of a dataset of box chairs; without it that variant is left out."""
-    results: Path = RESULTS
-    smoke: bool = False
-    """A test run with tiny networks and one step, which takes seconds."""
 
 
 # ------------------------------------------------------------------ one variant
@@ -186,14 +183,11 @@ def run(config: Config) -> dict[str, Any]:
             continue
         settings = replace(VARIANTS[name], steps=config.steps)
         if config.smoke:
-            settings = replace(settings, architecture=tiny(settings.architecture), batch=4)
+            settings = tiny(settings, batch=4)
         if found.get(name, {}).get("settings") == json.loads(json.dumps(asdict(settings))):
             continue
         folder, data = config.output / name.replace(" ", "-"), examples(name, config)
-        for report in train(folder, data, settings):
-            print(f"{name}: step {report.step}, loss {report.loss:.4f}, "
-                  f"{report.samples_per_second:.0f} samples/s", flush=True)  # fmt: skip
-        prior = finished_prior(folder, data, settings, samples=2048)
+        prior = train_reporting(name, folder, data, settings)
         found[name] = judge(prior, tests, faulty, config) | {
             "settings": asdict(settings), "samples": settings.steps * settings.batch
         }  # fmt: skip
@@ -229,32 +223,31 @@ def plot(found: dict[str, Any], path: Path) -> None:
         "first code, faulty inputs": lambda s: s["faulty inputs"],
     }
     names = [n for group in GROUPS.values() for n in group[1:] if n in found]
-    fig = Figure(figsize=(11, 0.3 * len(names) + 1.2))
-    axes = fig.subplots(1, len(figures), sharey=True)
-    for ax, (title, figure) in zip(axes, figures.items(), strict=True):
-        base = figure(found["plain"])
-        gains = np.array([figure(found[name]) - base for name in names])
-        rows = np.arange(len(names))[::-1]
-        ax.axvline(0, color="0.6", lw=0.8)
-        ax.hlines(rows, 0, gains, color=COLORS["measured"], lw=2)
-        ax.plot(gains, rows, "o", color=COLORS["measured"], ms=5)
-        ax.set_title(f"{title}\nplain: {base:.3f}", fontsize=9)
-        ax.set_yticks(rows, names, fontsize=9)
-        ax.tick_params(axis="x", labelsize=8)
-        ax.spines[["top", "right", "left"]].set_visible(False)
-        ax.grid(axis="x", color="0.92")
-        ax.set_axisbelow(True)
-    axes[len(axes) // 2].set_xlabel("IoU gained over the plain variant", fontsize=9)
-    fig.tight_layout()
-    with atomic_path(path) as temporary:
-        fig.savefig(temporary, dpi=150, format="png")
+    rows = np.arange(len(names))[::-1]
+    with drawn(path, 11, 0.3 * len(names) + 1.2) as fig:
+        fig.set_layout_engine("none")
+        axes = fig.subplots(1, len(figures), sharey=True)
+        for ax, (title, figure) in zip(axes, figures.items(), strict=True):
+            base = figure(found["plain"])
+            gains = np.array([figure(found[name]) - base for name in names])
+            ax.axvline(0, color="0.6", lw=0.8)
+            ax.hlines(rows, 0, gains, color=COLORS["measured"], lw=2)
+            ax.plot(gains, rows, "o", color=COLORS["measured"], ms=5)
+            ax.set_title(f"{title}\nplain: {base:.3f}", fontsize=9)
+            ax.set_yticks(rows, names, fontsize=9)
+            ax.tick_params(axis="x", labelsize=8)
+            ax.spines[["top", "right", "left"]].set_visible(False)
+            ax.grid(axis="x", color="0.92")
+            ax.set_axisbelow(True)
+        axes[len(axes) // 2].set_xlabel("IoU gained over the plain variant", fontsize=9)
+        fig.tight_layout()
 
 
-def main() -> None:
-    config = tyro.cli(Config)
-    if config.smoke:
-        config = replace(config, steps=1, chairs=2, iterations=2, meshes=None,
-                         variants=("plain", "code 32"), results=config.output)  # fmt: skip
+def main(config: Config) -> None:
+    few = ("plain", "code 32")
+    config = config.reduced(
+        steps=1, chairs=2, iterations=2, meshes=None, variants=few, results=config.output
+    )
     found = run(config)
     for name, scores in found.items():
         print(line(name, scores))
@@ -262,4 +255,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Config))
