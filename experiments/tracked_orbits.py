@@ -17,6 +17,7 @@ Results: experiments/results/tracked_orbits.json and .png; a finished seat is no
 Time: 15 minutes on two cores.
 """
 
+import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -29,14 +30,14 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+import runs
+from figures import drawn
 from jaxshape.data import meshes
 from jaxshape.data.boxes import Box
 from jaxshape.data.capture import Capture, capture
 from jaxshape.data.virtual_cameras import VirtualCamera
-from jaxshape.files import atomic_path, write_json
 from jaxshape.geometry import camera
 from jaxshape.geometry.overlap import iou
 from jaxshape.mapping.config import MappingConfig, TrackingConfig
@@ -46,11 +47,9 @@ from jaxshape.mapping.tracking.views import view_of
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
 from jaxshape.report.palette import BLUE, FOG, INK, ORANGE, SKY
+from jaxshape.results.journal import Journal
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import refiner_for
-from runs import earlier, spread
-
-RESULTS = Path(__file__).parent / "results"
 
 # With 10 degrees a frame, every second one is a keyframe.
 MAPPING = MappingConfig(keyframe_angle=15.0, keyframe_distance=9.0, fusion="points")
@@ -65,11 +64,9 @@ TRUE_POSES = "true poses"
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.SeatsConfig):
     """Settings of the experiment."""
 
-    meshes: Path = Path("cad_chairs")
-    """Folder or archive of seats, +y up and +z in front."""
     seats: int = 32
     """Number of seats, spread over all seats."""
     frames: int = 36
@@ -81,37 +78,31 @@ class Config:
     iterations: int = 20
     """Steps of Adam after each keyframe."""
     workers: int = 2
-    results: Path = RESULTS
-    smoke: bool = False
-    """A test run with one seat and few frames, which takes seconds."""
 
 
 def main(config: Config) -> None:
-    if config.smoke:
-        config = replace(config, seats=1, frames=4, image_size=96, iterations=2, workers=1)
-    metrics = run(config)
-    plot(metrics, config.results / "tracked_orbits.png")
-    for name, figures in metrics["summary"].items():
+    config = config.reduced(seats=1, frames=4, image_size=96, iterations=2, workers=1)
+    journal = run(config)
+    plot(journal.rows, config.results / "tracked_orbits.png")
+    for name, figures in summarize(journal.rows).items():
         print(name.ljust(20), figures)
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: Config) -> Journal:
     """Run every system on every seat, and resume from earlier results of the same settings."""
-    path = config.results / "tracked_orbits.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("results", "workers")}
-    settings["meshes"] = config.meshes.name
-    done = earlier(path, settings, "seats")
-    sources = meshes.list_meshes(config.meshes)
-    chosen = [sources[i] for i in spread(len(sources), config.seats)]
-    missing = {one.name: one for one in chosen if one.name not in done}
+    journal = config.journal("tracked_orbits", **settings | {"meshes": config.meshes.name})
+    missing = {one.name: one for one in config.chosen() if one.name not in journal.rows}
+    began = time.perf_counter()
     with ProcessPoolExecutor(config.workers, get_context("spawn"), prepare_process) as pool:
         futures = {pool.submit(_run_seat, one, config): name for name, one in missing.items()}
         for number, future in enumerate(as_completed(futures), start=1):
-            done[futures[future]] = future.result()
+            now = time.perf_counter()
+            journal.add({futures[future]: future.result()}, now - began)
+            began = now
             print(f"{number} of {len(missing)} seats", flush=True)
-            metrics = {"settings": settings, "summary": summarize(done), "seats": done}
-            write_json(path, metrics)
-    return {"settings": settings, "summary": summarize(done), "seats": done}
+    journal.write({"summary": summarize(journal.rows)})
+    return journal
 
 
 # One seat ------------------------------------------------------------------------------------
@@ -137,10 +128,8 @@ def _run_seat(source: meshes.MeshSource, config: Config) -> dict[str, Any]:
 
 @cache
 def _search(iterations: int):
-    prior, search = (
-        load_prior("chair-autoencoder"),
-        RefineConfig(iterations=iterations, symmetry=False),
-    )
+    prior = load_prior("chair-autoencoder")
+    search = RefineConfig(iterations=iterations, symmetry=False)
     return prior, refiner_for("gradient:adam", prior, search), search
 
 
@@ -209,49 +198,45 @@ def _scores(step: Step, seen: Capture) -> tuple[float, float]:
 
 def summarize(seats: dict[str, Any]) -> dict[str, Any]:
     """Medians and means over the seats, for each system."""
-    summary = {}
-    for system in (*SYSTEMS, TRUE_POSES):
+    sizes = np.array([seat["diagonal"] for seat in seats.values()])
+
+    def of(system: str) -> dict[str, Any]:
         each = [seat[system] for seat in seats.values()]
         ate, error = (np.array([one[k] for one in each]) for k in ("ate_mm", "error_mm"))
-        sizes = np.array([seat["diagonal"] for seat in seats.values()])
-        summary[system] = {
+        last = {k: [one[k][-1] for one in each] for k in ("iou", "iou_composed")}
+        return {
             "ate_mm_median": round(float(np.median(ate)), 2),
             "ate_mm_mean": round(float(ate.mean()), 2),
             "ate_percent_median": round(float(np.median(ate / sizes / 10)), 3),
             "error_mm_median": round(float(np.median(error)), 2),
             "error_mm_mean": round(float(error.mean()), 2),
             "lost": sum(one["lost"] for one in each),
-            "iou": round(float(np.mean([one["iou"][-1] for one in each])), 4),
-            "iou_composed": round(float(np.mean([one["iou_composed"][-1] for one in each])), 4),
-        }
-    return summary
+        } | {k: round(float(np.mean(values)), 4) for k, values in last.items()}
+
+    return {system: of(system) for system in (*SYSTEMS, TRUE_POSES)}
 
 
-def plot(metrics: dict[str, Any], path: Path) -> None:
+def plot(rows: dict[str, Any], path: Path) -> None:
     """Drift of the keyframes, seat by seat, and IoU against the number of keyframes."""
-    seats = list(metrics["seats"].values())
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    drift, shape = figure.subplots(1, 2)
-    colors = [FOG, SKY, ORANGE, BLUE, INK]
-    for system, color in zip(SYSTEMS, colors, strict=False):
-        percent = [100 * s[system]["ate_mm"] / 1000 / s["diagonal"] for s in seats]
-        share = np.arange(1, len(seats) + 1) / len(seats)
-        drift.step(np.sort(percent), share, where="post", color=color, label=system, lw=2)
-    drift.set(xscale="log", xlabel="ATE, % of the diagonal", ylim=(0, 1.02))
-    drift.set_ylabel("share of the seats")
-    drift.legend(frameon=False)
-    for system, color in zip((*SYSTEMS, TRUE_POSES), colors, strict=True):
-        longest = max(len(s[system]["iou_composed"]) for s in seats)
-        curves = [[s[system]["iou_composed"][min(i, len(s[system]["iou_composed"]) - 1)]
-                   for s in seats] for i in range(longest)]  # fmt: skip
-        style = "--" if system == TRUE_POSES else "-"
-        shape.plot(np.arange(1, longest + 1), np.mean(curves, axis=1), style, color=color,
-                   label=system)  # fmt: skip
-    shape.set(xlabel="keyframes", ylabel="IoU of the composed shape, mean")
-    shape.xaxis.get_major_locator().set_params(integer=True)
-    shape.legend(frameon=False)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    seats, colors = list(rows.values()), [FOG, SKY, ORANGE, BLUE, INK]
+    with drawn(path, 10, 3.8) as figure:
+        drift, shape = figure.subplots(1, 2)
+        for system, color in zip(SYSTEMS, colors, strict=False):
+            percent = [100 * s[system]["ate_mm"] / 1000 / s["diagonal"] for s in seats]
+            share = np.arange(1, len(seats) + 1) / len(seats)
+            drift.step(np.sort(percent), share, where="post", color=color, label=system, lw=2)
+        drift.set(xscale="log", xlabel="ATE, % of the diagonal", ylim=(0, 1.02))
+        drift.set_ylabel("share of the seats")
+        for system, color in zip((*SYSTEMS, TRUE_POSES), colors, strict=True):
+            ious = [s[system]["iou_composed"] for s in seats]
+            longest = max(map(len, ious))
+            curves = [[one[min(i, len(one) - 1)] for one in ious] for i in range(longest)]
+            line = {"color": color, "ls": "--" if system == TRUE_POSES else "-"}
+            shape.plot(np.arange(1, longest + 1), np.mean(curves, axis=1), label=system, **line)
+        shape.set(xlabel="keyframes", ylabel="IoU of the composed shape, mean")
+        shape.xaxis.get_major_locator().set_params(integer=True)
+        for axes in (drift, shape):
+            axes.legend(frameon=False)
 
 
 if __name__ == "__main__":
