@@ -30,10 +30,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 
+import runs
+from figures import drawn
 from jaxshape.data.families import procedural_objects
-from jaxshape.files import atomic_path, write_json
+from jaxshape.files import write_json
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.calibration import Calibration
 from jaxshape.model.shapes import ShapePrior, decode, encode
@@ -51,7 +52,6 @@ from jaxshape.search.run import refine
 from jaxshape.search.space import whitened
 from study import Subject, listed, observed
 
-RESULTS = Path(__file__).parent / "results"
 FRAMES = (1, 4, 8)
 SEEN = EvaluateConfig(frames=FRAMES, camera="kinect", noise=True)
 SAMPLES, STEPS = 16, 60
@@ -63,7 +63,9 @@ AT_A_TIME = 6
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(runs.Config):
+    """Settings of the experiment."""
+
     seats: Path = Path("cad_chairs")
     """Folder of the CAD seats."""
     tables: Path | None = None
@@ -76,8 +78,6 @@ class Config:
     """Number of calibration chairs and of CAD seats in the auto-encoder's rows."""
     weights: Path | None = None
     """Weights of the conditional network; the package's weights by default."""
-    output: Path = RESULTS
-    """Folder of the results."""
 
 
 class Voxels(NamedTuple):
@@ -89,23 +89,20 @@ class Voxels(NamedTuple):
 
 
 Predictor = Callable[[ShapePrior, Any, Grids], tuple[jax.Array, jax.Array]]
+Seen = list[tuple[Subject, Case]]
 
 # ------------------------------------------------------------------ ways to say how sure
 
 
-def conditional(prior: ShapePrior, keys, grids: Grids) -> tuple[jax.Array, jax.Array]:
-    """The first code's shape, and the spread of samples of the conditional prior."""
-    config = RefineConfig(samples=SAMPLES)
-    found = reconstruct(keys, prior, grids.occupied, grids.occluded, None, config)
-    assert found.samples is not None
-    return found.fill_logits, jnp.std(found.samples, axis=1)
+def samples(method: str, prior: ShapePrior, keys, grids: Grids) -> tuple[jax.Array, jax.Array]:
+    """A method's shape, and the spread of samples about it.
 
-
-def curvature(prior: ShapePrior, keys, grids: Grids) -> tuple[jax.Array, jax.Array]:
-    """Adam's shape, and the spread of samples by Laplace's approximation about it."""
+    They are drawn from the conditional prior (`encoder`, the first code's shape) or, for the
+    auto-encoder, by Laplace's approximation.
+    """
     config = RefineConfig(samples=SAMPLES, iterations=STEPS)
-    adam = refiner_for("gradient:adam", prior, config)
-    found = reconstruct(keys, prior, grids.occupied, grids.occluded, adam, config)
+    refiner = refiner_for(method, prior, config)
+    found = reconstruct(keys, prior, grids.occupied, grids.occluded, refiner, config)
     assert found.samples is not None
     return found.fill_logits, jnp.std(found.samples, axis=1)
 
@@ -133,14 +130,11 @@ def covariance(scale: float, prior: ShapePrior, keys, grids: Grids):
 # ------------------------------------------------------------------ voxels and figures
 
 
-def cases_of(objects: Sequence[Any]) -> list[tuple[str, Case]]:
-    subjects = [Subject(one.name, "", one) for one in objects]
-    return [(subject.name, case) for subject, case in observed(subjects, SEEN)]
+def cases_of(objects: Sequence[Any]) -> Seen:
+    return list(observed([Subject(one.name, "", one) for one in objects], SEEN))
 
 
-def voxels(
-    predictor: Predictor, prior: ShapePrior, cases: list[tuple[str, Case]], frame: int
-) -> Voxels:
+def voxels(predictor: Predictor, prior: ShapePrior, cases: Seen, frame: int) -> Voxels:
     """The occluded voxels of all cases after the frame-th number of frames."""
     run, parts = jax.jit(predictor), []
     for first in range(0, len(cases), AT_A_TIME):
@@ -148,13 +142,13 @@ def voxels(
         rows = [some[i % len(some)] for i in range(AT_A_TIME)]
         grids = Grids(*(jnp.stack([jnp.float32(case.grids[i][frame]) for _, case in rows])
                         for i in (0, 1)))  # fmt: skip
-        keys = jnp.concatenate([case_keys(name, FRAMES[frame : frame + 1]) for name, _ in rows])
+        keys = jnp.concatenate([case_keys(one.name, FRAMES[frame : frame + 1]) for one, _ in rows])
         logits, spread = jax.device_get(run(prior, keys, grids))
         for i, (_, case) in enumerate(some):
             hidden = np.asarray(case.grids.occluded[frame]) > 0.5
             truth = np.asarray(case.surface[frame])[hidden]
             parts.append(Voxels(logits[i][hidden], spread[i][hidden], truth))
-    return Voxels(*map(np.concatenate, zip(*parts, strict=True)))
+    return pooled(parts)
 
 
 def nats(found: Voxels, calibration: Calibration) -> float:
@@ -187,45 +181,46 @@ def pooled(parts: Sequence[Voxels]) -> Voxels:
 # ------------------------------------------------------------------ the comparison
 
 
-def compared(config: Config, sets: dict[str, list], chairs: list) -> dict[str, Any]:
+def compared(config: Config, sets: dict[str, Seen], chairs: Seen) -> dict[str, Any]:
     """Figures of the conditional network, by set, number of frames and way."""
-    prior = load_prior(config.weights)
-    look = partial(voxels, conditional, prior)
+    look = partial(voxels, partial(samples, "encoder"), load_prior(config.weights))
     calibrating = pooled([look(chairs, i) for i in range(len(FRAMES))])
     ways = {
         "decoder as it is": (without_spread, Calibration()),
         "decoder": (without_spread, fit(*without_spread(calibrating))),
         "conditional prior": (lambda x: x, fit(*calibrating)),
     }
-    figures: dict[str, Any] = {}
-    for name, cases in sets.items():
-        for i, k in enumerate(FRAMES):
-            found = look(cases, i)
-            for way, (view, calibration) in ways.items():
-                row = figures_of(view(found), calibration)
-                figures.setdefault(name, {}).setdefault(str(k), {})[way] = row
-                print(f"{name}, {k} frames, {way}: ECE {row['ece']:.3f}, {row['nats']:.4f} nats")
+
+    def of(cases: Seen, frame: int) -> dict[str, Any]:
+        found = look(cases, frame)
+        return {way: figures_of(view(found), c) for way, (view, c) in ways.items()}
+
     return {
-        "figures": figures,
+        "figures": {
+            name: {str(k): of(cases, i) for i, k in enumerate(FRAMES)}
+            for name, cases in sets.items()
+        },
         "calibrations": {way: list(c) for way, (_, c) in ways.items()},
     }
 
 
-def searched(seats: list, chairs: list) -> dict[str, Any]:
+def searched(seats: Seen, chairs: Seen) -> dict[str, Any]:
     """Figures of the auto-encoder's ways after 4 frames."""
-    prior, rows, frame = load_prior("chair-autoencoder"), {}, FRAMES.index(4)
-    found = {"curvature": [voxels(curvature, prior, x, frame) for x in (chairs, seats)]}
+    prior, frame = load_prior("chair-autoencoder"), FRAMES.index(4)
+    adam = partial(samples, "gradient:adam")
+    found = {"curvature": [voxels(adam, prior, x, frame) for x in (chairs, seats)]}
     found["decoder"] = [without_spread(x) for x in found["curvature"]]
     tried = {s: voxels(partial(covariance, s), prior, chairs, frame) for s in SCALES}
     best = min(SCALES, key=lambda s: nats(tried[s], fit(*tried[s])))
     found["CMA-ES"] = [tried[best], voxels(partial(covariance, best), prior, seats, frame)]
-    for way, (fitted, tested) in found.items():
-        rows[f"auto-encoder, {way}"] = figures_of(tested, fit(*fitted))
-        print(f"auto-encoder, {way}: ECE {rows[f'auto-encoder, {way}']['ece']:.3f}")
-    return {"frames": 4, "seats": len(seats), "scale": best, "figures": rows}
+    figures = {
+        f"auto-encoder, {way}": figures_of(tested, fit(*fitted))
+        for way, (fitted, tested) in found.items()
+    }
+    return {"frames": 4, "seats": len(seats), "scale": best, "figures": figures}
 
 
-def two_kinds(config: Config, cases: list[tuple[str, Case]], path: Path) -> str:
+def two_kinds(config: Config, cases: Seen, path: Path) -> str:
     """Draw the object whose hypotheses differ most after one frame, with their blurred mean."""
     prior, search = load_prior(config.weights), RefineConfig(samples=SAMPLES)
 
@@ -239,57 +234,52 @@ def two_kinds(config: Config, cases: list[tuple[str, Case]], path: Path) -> str:
         apart = 1 - jnp.sum(a & b) / jnp.maximum(jnp.sum(a | b), 1)
         return found, chosen, share, apart * 2 * jnp.min(share)
 
-    best: tuple[float, Any, Any] = (-1.0, None, None)
-    for name, case in cases:
-        grids = Grids(*(jnp.float32(x[:1]) for x in case.grids[:2]))
-        found = jax.device_get(look(case_keys(name, FRAMES[:1]), grids))
-        if found[3] > best[0]:
-            best = float(found[3]), (name, case), found
-    _, (name, case), (found, chosen, share, _) = best
+    def looked(one: tuple[Subject, Case]) -> Any:
+        grids = Grids(*(jnp.float32(x[:1]) for x in one[1].grids[:2]))
+        return one, jax.device_get(look(case_keys(one[0].name, FRAMES[:1]), grids))
+
+    best = max(map(looked, cases), key=lambda one: one[1][3])
+    (chair, case), (found, chosen, share, _) = best
     F = np.asarray(case.grids.occupied[0]) * (1 - np.asarray(case.grids.occluded[0])) > 0.5
     shown = {f"hypothesis {i + 1}: {s:.0%}": found.samples[0, c] > 0
              for i, (c, s) in enumerate(zip(chosen, share, strict=True))}  # fmt: skip
     shown["probability above 1/2"] = found.probability[0] > 0.5
     shown["truth"] = np.asarray(case.surface[0])
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
-    for i, (title, grid) in enumerate(shown.items()):
-        axes = figure.add_subplot(1, 4, i + 1)
-        labels = np.where(F, 1, np.where(grid, 2, 0))
-        axes.imshow(grid_panel("", labels, "measured", "predicted").image)
-        axes.set_title(title, fontsize=9)
-        axes.set_axis_off()
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130, format="png")
-    return name
+    with drawn(path, 12, 3.4, dpi=130) as figure:
+        for axes, (title, grid) in zip(figure.subplots(1, 4), shown.items(), strict=True):
+            labels = np.where(F, 1, np.where(grid, 2, 0))
+            axes.imshow(grid_panel("", labels, "measured", "predicted").image)
+            axes.set_title(title, fontsize=9)
+            axes.set_axis_off()
+    return chair.name
 
 
 def plot(figures: dict[str, Any], path: Path) -> None:
     """Reliability curves: observed frequency against predicted probability."""
-    figure = Figure(figsize=(3.4 * len(FRAMES), 3.2 * len(figures)), layout="constrained")
-    panels = figure.subplots(len(figures), len(FRAMES), squeeze=False, sharex=True, sharey=True)
-    for row, (name, by_frames) in zip(panels, figures.items(), strict=True):
-        for axes, (k, ways) in zip(row, by_frames.items(), strict=True):
-            axes.plot([0, 1], [0, 1], color="0.8", lw=1)
-            for i, (way, one) in enumerate(ways.items()):
-                x, y, share = (
-                    np.array(one["curve"][c]) for c in ("predicted", "occurred", "share")
-                )
-                some = share > 1e-3
-                axes.plot(x[some], y[some], marker="o", ms=3, color=f"C{i}",
-                          label=f"{way}: ECE {one['ece']:.3f}")  # fmt: skip
-            axes.set_title(f"{name}, {k} frame{'s' * (k != '1')}", fontsize=9)
-            axes.legend(frameon=False, fontsize=6.5, loc="upper left")
-            tidy(axes)
-    for axes in panels[-1]:
-        axes.set_xlabel("probability that was given")
-    for row in panels:
-        row[0].set_ylabel("share that is occupied")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130, format="png")
+    with drawn(path, 3.4 * len(FRAMES), 3.2 * len(figures), dpi=130) as figure:
+        shape = len(figures), len(FRAMES)
+        panels = figure.subplots(*shape, squeeze=False, sharex=True, sharey=True)
+        for row, (name, by_frames) in zip(panels, figures.items(), strict=True):
+            for axes, (k, ways) in zip(row, by_frames.items(), strict=True):
+                axes.plot([0, 1], [0, 1], color="0.8", lw=1)
+                for i, (way, one) in enumerate(ways.items()):
+                    curve = {c: np.array(values) for c, values in one["curve"].items()}
+                    some = curve["share"] > 1e-3
+                    style = {"marker": "o", "ms": 3, "color": f"C{i}"}
+                    label = f"{way}: ECE {one['ece']:.3f}"
+                    x, y = curve["predicted"][some], curve["occurred"][some]
+                    axes.plot(x, y, label=label, **style)
+                axes.set_title(f"{name}, {k} frame{'s' * (k != '1')}", fontsize=9)
+                axes.legend(frameon=False, fontsize=6.5, loc="upper left")
+                tidy(axes)
+        for axes in panels[-1]:
+            axes.set_xlabel("probability that was given")
+        for row in panels:
+            row[0].set_ylabel("share that is occupied")
 
 
-def main() -> None:
-    config = tyro.cli(Config)
+def main(config: Config) -> None:
+    config = config.reduced(chairs=0, calibration=6, searched=2)
     chairs = cases_of(procedural_objects("chair", config.calibration, FIRST_SEED))
     sets = {"CAD seats": cases_of(listed(config.seats, 0))}
     if config.tables is not None:
@@ -298,12 +288,15 @@ def main() -> None:
         sets["procedural chairs"] = cases_of(listed(None, config.chairs))
     found = compared(config, sets, chairs)
     few = config.searched
-    found["auto-encoder"] = searched(sets["CAD seats"][:few], chairs[:few]) if few else None
-    config.output.mkdir(parents=True, exist_ok=True)
-    name = two_kinds(config, sets["CAD seats"], config.output / "uncertainty_hypotheses.png")
-    write_json(config.output / "uncertainty.json", found | {"two kinds": name})
-    plot(found["figures"], config.output / "uncertainty.png")
+    found["auto-encoder"] = searched(sets["CAD seats"][:few], chairs[:few])
+    name = two_kinds(config, sets["CAD seats"], config.results / "uncertainty_hypotheses.png")
+    write_json(config.results / "uncertainty.json", found | {"two kinds": name})
+    plot(found["figures"], config.results / "uncertainty.png")
+    for name, by_frames in found["figures"].items():
+        for k, ways in by_frames.items():
+            for way, one in ways.items():
+                print(f"{name}, {k} frames, {way}: ECE {one['ece']:.3f}, {one['nats']:.4f} nats")
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Config))
