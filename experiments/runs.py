@@ -1,6 +1,5 @@
 """Common code of all experiments: settings, choice of objects, and rows that are made once."""
 
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -51,12 +50,6 @@ class SeatsConfig(Config):
 def spread(available: int, count: int) -> list[int]:
     """Indices of `count` objects, spread over all available ones; all if there are not more."""
     return np.linspace(0, available - 1, min(count, available)).round().astype(int).tolist()
-
-
-def earlier(path: Path, settings: dict[str, Any], rows: str) -> dict[str, Any]:
-    """The rows that a run with the same settings has written under this name, or none."""
-    content = json.loads(path.read_text()) if path.is_file() else {}
-    return content[rows] if content.get("settings") == settings else {}
 
 
 def complete(
