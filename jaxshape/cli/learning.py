@@ -172,7 +172,8 @@ class Train:
     """Folder for NAME.safetensors, NAME.md, card.json, metrics.jsonl and the checkpoint, and with
     --meshes also for the dataset and evaluation.json; out/NAME by default."""
     start: Path | None = None
-    """Initial weights, of a network of the same sizes; random by default."""
+    """Initial weights, of a network of the same sizes: a file, or `chair` for those of the package;
+    random by default."""
     licence: str = "not stated"
     """Licence of the weights, for their card; the licence of the meshes may restrict it."""
     model: Literal["network", "pca"] = "network"
