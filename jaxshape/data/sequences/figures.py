@@ -2,6 +2,7 @@
 
 import math
 import re
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from jaxshape.data.sequences.frames import (
     read_color,
     read_mask,
     read_raw_depth,
+    read_turn,
 )
 from jaxshape.data.sequences.hypotheses import Reading
 from jaxshape.data.sequences.listing import number_pattern
@@ -170,6 +172,18 @@ def damaged_pictures(sequence: Sequence) -> tuple[str, ...]:
         except SequenceError as error:
             damaged.append(str(error))
     return tuple(damaged)
+
+
+def turned_pictures(sequence: Sequence) -> tuple[str, ...]:
+    """How each sampled colour image or mask is to be shown, if not as it is stored."""
+    turned = []
+    for index in _sampled(sequence):
+        files = sequence.files[index]
+        for picture in (files.color, files.mask):
+            with suppress(SequenceError):  # `damaged_pictures` names it
+                if picture is not None and (turn := read_turn(picture)):
+                    turned.append(turn)
+    return tuple(turned)
 
 
 def gaps_of(sequence: Sequence) -> tuple[Gap, ...]:

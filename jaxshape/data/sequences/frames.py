@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image
+from PIL import ExifTags, Image
 
 from jaxshape import limits
 from jaxshape.data.sequences.errors import SequenceError as SequenceError
@@ -26,6 +26,17 @@ _USUAL_MEDIAN_DEPTH = 2.0  # metres: an object in a room
 _INSTANCE, _NUMBERED = 1e-3, 0.95
 """Least share of an image that an object in a numbered mask fills, and least share of the mask's
 pixels that all numbered objects fill together."""
+
+_TURNS = {
+    2: "mirrored",
+    3: "turned by 180 degrees",
+    4: "mirrored and turned by 180 degrees",
+    5: "mirrored and turned by 90 degrees",
+    6: "turned clockwise by 90 degrees",
+    7: "mirrored and turned by 90 degrees",
+    8: "turned anticlockwise by 90 degrees",
+}
+"""What the EXIF orientation of an image asks for, other than 1."""
 
 _CONFIDENT = 1  # of ARKit's ratings 0, 1 and 2 of depths: 0 is a guess
 
@@ -296,6 +307,15 @@ def read_color(path: Picture, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 
         color = image if image.mode == "RGB" else image.convert("RGB")
         scaled = color.resize((shape[1], shape[0]), Image.Resampling.BILINEAR)
     return np.array(scaled)
+
+
+def read_turn(path: Picture) -> str | None:
+    """Read how an image is to be shown by its EXIF orientation, which is not applied; None for as
+    it is stored."""
+    with opened(path) as image:
+        if image.format == "TIFF":  # there Pillow applies it
+            return None
+        return _TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
 
 
 def read_mask(path: Picture, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:

@@ -16,6 +16,7 @@ from jaxshape.data.sequences.figures import (
     gaps_of,
     poses_of,
     rate_of,
+    turned_pictures,
 )
 from jaxshape.data.sequences.frames import (
     Finding,
@@ -88,6 +89,7 @@ def inspect_sequence(
     warnings = [
         *sequence.findings,
         *_of_images(depths, damaged_pictures(sequence)),
+        *_of_turns(turned_pictures(sequence)),
         *_of_scale(depths.median, sequence.depth_scale, reading),
         *_of_camera(sequence),
         *_of_convention(reading, is_used),
@@ -151,6 +153,16 @@ def _of_images(depths: Depths, pictures: tuple[str, ...]) -> Iterator[Finding]:
             "other is above its half",
             "If it stands for nothing measured, write 0 there: otherwise all before it counts as "
             "free.",
+        )
+
+
+def _of_turns(turns: tuple[str, ...]) -> Iterator[Finding]:
+    if turns:
+        yield Finding(
+            f"{len(turns)} sampled colour images or masks are to be shown {turns[0]} by their EXIF "
+            "orientation, and are read as they are stored",
+            "If they then do not lie as the depth images, save them with the turn applied; "
+            "otherwise save them without the tag.",
         )
 
 

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from recordings import WRITERS, H, K, W, record, save, write_7_scenes, write_redwood, write_tum
 from scipy.spatial.transform import Rotation
 
@@ -160,6 +160,27 @@ def test_damaged_colours_and_masks(tmp_path):
     (tmp_path / "frame-000003.mask.png").write_bytes(b"")
     (warning,) = warnings_of(tmp_path)
     assert "cannot be used: 2; " in warning and "frame-000002.color.png" in warning
+
+
+@pytest.mark.parametrize(
+    "orientation, said",
+    [(1, None), (3, "shown turned by 180"), (6, "turned clockwise by 90"), (9, None)],
+)
+def test_an_exif_orientation_is_named_and_not_applied(tmp_path, orientation, said):
+    write_7_scenes(tmp_path, SEEN)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    for path in sorted(tmp_path.glob("*.color.png")):
+        stored = Image.open(path)
+        path.unlink()
+        stored.save(path.with_suffix(".jpg"), exif=exif, quality=95)
+    np.testing.assert_array_equal(open_sequence(tmp_path)[3].color, np.array(Image.open(
+        tmp_path / "frame-000003.color.jpg")))  # fmt: skip
+    warnings = warnings_of(tmp_path)
+    assert len(warnings) == (said is not None)
+    assert said is None or re.search(
+        f"12 sampled .* {said} degrees .* without the tag", warnings[0]
+    )
 
 
 def test_images_that_cannot_be_read_at_all(tmp_path):
