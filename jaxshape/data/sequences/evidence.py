@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxshape.data.sequences.conventions import our_depth, our_pose
-from jaxshape.data.sequences.frames import SATURATED, Sequence, SequenceError, read_raw_depth
+from jaxshape.data.sequences.frames import Sequence, SequenceError, is_measured, read_raw_depth
 from jaxshape.data.sequences.poses import StoredByColumns
 
 Pose = Float[np.ndarray, "4 4"]
@@ -106,7 +106,7 @@ def _depth(sequence: Sequence, index: int) -> Float[np.ndarray, "h w"] | None:
     """A depth image at the depth scale of the recording, even if implausible; None if damaged."""
     with suppress(SequenceError):  # reading the frame reports it
         raw = read_raw_depth(sequence.files[index].depth, sequence.shape)
-        valid = (raw > 0) & (raw < SATURATED)
+        valid = is_measured(raw)
         depth = np.where(valid, raw / sequence.depth_scale, 0)
         if sequence.correct_depth is not None:
             depth = sequence.correct_depth(depth, sequence.camera_of(index))

@@ -13,6 +13,7 @@ from jaxshape.data.sequences.frames import (
     Sequence,
     SequenceError,
     depth_scale_fault,
+    is_measured,
     read_color,
     read_mask,
     read_raw_depth,
@@ -102,18 +103,20 @@ def depths_of(sequence: Sequence) -> Depths:
     if not raw:
         raise damaged[0]
     values = np.stack(raw)
-    valid = (values > 0) & (values < SATURATED)
+    valid = is_measured(values)
     scale = sequence.depth_scale
     median = float(np.median(values[valid])) / scale if valid.any() else 0.0
     for picture, image, known in zip(read, values, valid, strict=True):
-        own = float(np.median(image[known])) / scale if known.any() else median
+        if not known.any():
+            continue
+        own = float(np.median(image[known])) / scale
         fault = depth_scale_fault(own, scale)
         if fault is not None and not median / 10 < own < median * 10:  # this image alone
             damaged.append(f"{picture}: {fault.sentence}")
     return Depths(
         median=median,
         invalid=float(np.mean(~valid)),
-        saturated=float(np.mean(values >= SATURATED)),
+        saturated=float(np.mean(values == SATURATED)),
         sampled=len(raw),
         black=int(np.sum(~valid.any(axis=(1, 2)))),
         damaged=tuple(map(str, damaged)),

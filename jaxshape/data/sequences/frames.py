@@ -15,9 +15,14 @@ from jaxshape.data.sequences.errors import SequenceError as SequenceError
 from jaxshape.data.sequences.rasters import Picture, open_picture
 
 SATURATED = 65535
-"""The value that depth cameras write where they have no reliable depth; read as 0, unknown."""
+"""The largest number of 16 bits, which depth cameras write where they have no reliable depth; read
+as 0, unknown."""
 
-USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
+BACKGROUND = 1e9
+"""Least number that renderers write where there is nothing, for images of more than 16 bits; depths
+of 1 km in micrometres."""
+
+USUAL_DEPTH_SCALES = (1.0, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0, 1e6)
 """Common depth units per metre."""
 
 _PLAUSIBLE_MEDIAN_DEPTH = (0.1, 20.0)  # metres: the range of depth cameras, with a margin
@@ -209,7 +214,7 @@ class Sequence:
 def read_depth(
     path: Picture, shape: tuple[int, int], *, depth_scale: float
 ) -> Float[np.ndarray, "h w"]:
-    """Read a depth image as metres in float32; values 0 and 65535, and not finite ones, become 0.
+    """Read a depth image as metres in float32; 0 where nothing was measured (`is_measured`).
 
     Args:
         path: The image.
@@ -221,11 +226,16 @@ def read_depth(
             depth shows that `depth_scale` is wrong.
     """
     raw = read_raw_depth(path, shape)
-    valid = (raw > 0) & (raw < SATURATED)
+    valid = is_measured(raw)
     depth = np.where(valid, raw / np.float32(depth_scale), np.float32(0))
     if valid.any() and (fault := depth_scale_fault(float(np.median(depth[valid])), depth_scale)):
         raise SequenceError(f"{path}: {fault.evidence}: {fault.advice}")
     return depth
+
+
+def is_measured(raw: Float[np.ndarray, "*batch h w"]) -> Bool[np.ndarray, "*batch h w"]:
+    """Whether the numbers of depth images, in any unit, are depths."""
+    return (raw > 0) & (raw != SATURATED) & (raw < BACKGROUND)
 
 
 def read_raw_depth(path: Picture, shape: tuple[int, int]) -> Float[np.ndarray, "h w"]:

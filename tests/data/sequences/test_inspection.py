@@ -5,7 +5,18 @@ import re
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from recordings import WRITERS, H, K, W, record, save, write_7_scenes, write_redwood, write_tum
+from recordings import (
+    WRITERS,
+    H,
+    K,
+    W,
+    record,
+    save,
+    write_7_scenes,
+    write_open3d,
+    write_redwood,
+    write_tum,
+)
 from scipy.spatial.transform import Rotation
 
 from jaxshape.data.sequences import SequenceError, open_sequence
@@ -127,6 +138,29 @@ def test_damaged_black_and_saturated_images(tmp_path):
     assert "sampled depth images that cannot be used: 1; " in warnings
     assert "7 of 11 sampled depth images hold no valid depth" in warnings
     assert "64% of the depth pixels hold nothing, 55% are saturated" in warnings
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.float32])
+def test_micrometres_are_not_saturated(tmp_path, kind):
+    write_open3d(tmp_path, SEEN)
+    (tmp_path / "trajectory.log").unlink()
+    for i, depth in enumerate(SEEN.depth):
+        (tmp_path / f"depth/depth_{i}.png").unlink()
+        np.save(tmp_path / f"depth/depth_{i}.npy", (depth * 1e6).astype(kind))
+    found = inspect_sequence(open_sequence(tmp_path))
+    assert found.depths.saturated == found.depths.invalid == 0
+    (warning,) = [one for one in found.warnings if "median depth" in one.evidence]
+    assert warning.advice == "Is --depth-scale 1e+06 meant?"
+    sequence = open_sequence(tmp_path, depth_scale=1e6)
+    np.testing.assert_allclose(sequence[2].depth, SEEN.depth[2], rtol=1e-6)
+    np.save(tmp_path / "depth/depth_2.npy", np.float32([[65535, np.inf, 1e10, 2e6]] * H).repeat(
+        W // 4, axis=1))  # fmt: skip
+    assert np.unique(sequence[2].depth).tolist() == [0, 2]
+
+
+def test_a_recording_without_any_depth_is_inspected(tmp_path):
+    write_7_scenes(tmp_path, SEEN._replace(depth=0 * SEEN.depth))
+    assert "12 of 12 sampled depth images hold no valid depth" in " ".join(warnings_of(tmp_path))
 
 
 def test_single_images_of_another_unit_are_named(tmp_path):
