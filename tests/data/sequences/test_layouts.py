@@ -209,6 +209,18 @@ def test_depth_images_that_a_list_leaves_out_are_counted(tmp_path):
     assert remark.evidence == "4 of 6 images in depth/ are not listed in depth.txt"
 
 
+def test_a_list_may_hold_the_associated_colours_too(tmp_path):
+    """And names may have blanks."""
+    write_tum(tmp_path, SEEN)
+    lines = (tmp_path / "depth.txt").read_text().splitlines()[2:]
+    paired = [f"{line} {line.replace('depth/', 'rgb/')}" for line in lines]
+    (tmp_path / lines[0].split()[1]).rename(tmp_path / "depth/a 1.0 b.png")
+    paired[0] = lines[0].split()[0] + " depth/a 1.0 b.png"
+    (tmp_path / "depth.txt").write_text("\n".join(paired))
+    for i, frame in enumerate(open_sequence(tmp_path)):
+        np.testing.assert_allclose(frame.depth, SEEN.depth[i], rtol=1e-6)
+
+
 def test_tum_colours_without_a_list_are_found_by_name_or_missed(tmp_path):
     write_tum(tmp_path, SEEN, color_delay=0)
     (tmp_path / "rgb.txt").unlink()

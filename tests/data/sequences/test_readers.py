@@ -269,6 +269,20 @@ def test_depth_images_that_the_scene_does_not_name_are_left_out_and_counted(tmp_
     assert sequence.findings[1].evidence == "2 depth images are not in scene_camera.json"
 
 
+def test_keys_of_a_scene_may_have_zeros_in_front(tmp_path):
+    write_bop(tmp_path, SEEN)
+    expected = list(open_sequence(tmp_path))
+    for name in ("scene_camera.json", "scene_gt.json"):
+        content = json.loads((tmp_path / name).read_text())
+        padded = {f"{int(key):06d}": value for key, value in content.items()}
+        (tmp_path / name).write_text(json.dumps(padded))
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == len(expected)
+    for frame, known in zip(sequence, expected, strict=True):
+        np.testing.assert_array_equal(frame.T_world_camera, known.T_world_camera)
+        np.testing.assert_array_equal(frame.mask, known.mask)
+
+
 def test_depth_is_in_the_unit_of_the_scene(tmp_path):
     write_bop(tmp_path, SEEN, unit=1.0)
     assert open_sequence(tmp_path).depth_scale == 1000
@@ -276,6 +290,19 @@ def test_depth_is_in_the_unit_of_the_scene(tmp_path):
     about["3"]["depth_scale"] = 0.5
     (tmp_path / "scene_camera.json").write_text(json.dumps(about))
     assert "[0.5, 1.0]" in fault_of(tmp_path)
+
+
+def test_times_of_arrays_that_do_not_rise_are_not_used_and_named(tmp_path):
+    write_npz(tmp_path, SEEN)
+    with np.load(tmp_path / "scan.npz") as file:
+        arrays = dict(file)
+    for times, remarks in (([0.0, 1, 2, 3, 4], 0), ([0.0, 1, 1, 2, 3], 1)):
+        np.savez(tmp_path / "scan.npz", times=np.array(times), **arrays)
+        sequence = open_sequence(tmp_path)
+        assert (sequence.times is None) == bool(remarks)
+        assert [one.evidence[:21] for one in sequence.findings] == [
+            "the times do not rise"
+        ] * remarks
 
 
 # Stray Scanner and Record3D --------------------------------------------------------------------
@@ -291,6 +318,18 @@ def test_tables_of_rows_of_other_lengths_are_refused(tmp_path):
     np.testing.assert_allclose(
         open_sequence(tmp_path)[2].T_world_camera, SEEN.T_world_camera[2], atol=1e-6
     )
+
+
+def test_missing_confidence_maps_are_counted(tmp_path):
+    write_stray_scanner(tmp_path, SEEN)
+    assert not open_sequence(tmp_path).findings
+    (tmp_path / "confidence/000002.png").unlink()
+    sequence = open_sequence(tmp_path)
+    (finding,) = sequence.findings
+    assert "1 of 5 depth images have no confidence map" in finding.evidence
+    np.testing.assert_allclose(sequence[2].depth, SEEN.depth[2], rtol=1e-6)
+    shutil.rmtree(tmp_path / "confidence")  # as older recordings
+    assert not open_sequence(tmp_path).findings
 
 
 def test_a_film_is_named_and_the_camera_is_of_its_size(tmp_path):
@@ -392,6 +431,17 @@ def test_lenses_and_missing_depth_are_remarked(tmp_path):
     assert len(sequence) == 4
     left, bent = (finding.evidence for finding in sequence.findings)
     assert left.startswith("1 frames have no depth") and "-0.2" in bent
+
+
+def test_a_depth_image_that_is_named_twice_is_read_once(tmp_path):
+    write_nerfstudio(tmp_path, SEEN)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    edit(tmp_path, frames=[one for frame in frames for one in (frame, frame)])
+    sequence = open_sequence(tmp_path)
+    assert len(set(sequence.names)) == len(sequence) == len(frames)
+    (remark,) = sequence.findings
+    assert "5 frames name the depth image of an earlier frame" in remark.evidence
+    np.testing.assert_allclose(sequence[3].T_world_camera, SEEN.T_world_camera[3], atol=1e-6)
 
 
 def test_colours_that_are_named_and_missing_are_counted(tmp_path):

@@ -25,6 +25,11 @@ _NAMES = {
 _POSES = re.compile("pose|extrinsic|traj|w2c|c2w|cam", re.IGNORECASE)
 _OTHERS = re.compile(r"distort|dist_?coef|^dist$|depth_?scale", re.IGNORECASE)
 
+_UNUSED = Finding(
+    "the times do not rise, so they are not used",
+    "Save the frames in the order of their times, in seconds since one start.",
+)
+
 
 def fits(contents: Contents) -> bool:
     return len(contents.files) == len(_files(contents)) == 1 and not contents.folders
@@ -57,6 +62,7 @@ def list_frames(contents: Contents) -> Listed:
     }
     poses = _checked(arrays.get("poses"), [(count, 4, 4)], path, "poses")
     times = _checked(arrays.get("times"), [(count,)], path, "times")
+    rises = times is None or _rises(times)
     K = _checked(arrays.get("K"), [(3, 3), (1, 3, 3), (count, 3, 3)], path, "K")
 
     def stored(name: str, array: np.ndarray | None, index: int) -> Stored | None:
@@ -74,9 +80,9 @@ def list_frames(contents: Contents) -> Listed:
         ),
         depth_scale=1.0 if depth.dtype.kind == "f" else 1000.0,
         read_pose=None if poses is None else lambda i: known(poses[i], f"{path}: pose {i}"),
-        times=times if times is not None and _rises(times) else None,
+        times=times if rises else None,
         calibration=None if K is None else _calibration(K, path),
-        findings=tuple(_unread(path, has_poses=poses is not None)),
+        findings=(*_unread(path, has_poses=poses is not None), *(() if rises else (_UNUSED,))),
     )
 
 

@@ -36,7 +36,7 @@ def list_frames(contents: Contents) -> Listed:
     if every image has one; otherwise it is the frame of the object that most images show.
     """
     source = contents.folder / "scene_camera.json"
-    about = read_json_object(source)
+    about = _by_key(source)
     every = depth_images(contents)
     depth = {name: path for name, path in every.items() if _key(name) in about}
     if not depth:
@@ -65,8 +65,13 @@ def _left_out(count: int, source: Path) -> tuple[Finding, ...]:
 
 
 def _key(name: str) -> str:
-    """The key of an image in the JSON files: its number without zeros in front."""
-    return str(int(name)) if name.isdecimal() else name
+    """The key of an image: its number without zeros in front, as the JSON files usually have it."""
+    return (name.lstrip("0") or "0") if name.isdecimal() else name
+
+
+def _by_key(source: Path) -> dict[str, Any]:
+    """The entries of a JSON file by the keys of their images."""
+    return {_key(name): entry for name, entry in read_json_object(source).items()}
 
 
 def _cameras(images: list[Any], source: Path) -> Float[np.ndarray, "n 3 3"]:
@@ -99,7 +104,7 @@ def _depth_scale(images: list[Any], source: Path) -> float:
 def _ground_truth(contents: Contents) -> dict[str, Any]:
     if "scene_gt.json" not in contents.files:
         return {}
-    return read_json_object(contents.folder / "scene_gt.json")
+    return _by_key(contents.folder / "scene_gt.json")
 
 
 def _instances(objects: Any) -> list[Instance]:

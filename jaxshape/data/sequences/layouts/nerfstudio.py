@@ -50,7 +50,11 @@ def list_frames(contents: Contents) -> Listed:
     about = read_json_object(source)
     frames = sorted(_frames(about, source), key=_order)
     depth = _depth_of(contents, frames, source)
-    kept = [i for i, path in enumerate(depth) if path is not None]
+    first: dict[Path, int] = {}
+    for i, path in enumerate(depth):
+        if path is not None:
+            first.setdefault(path, i)
+    kept = list(first.values())
     if not kept:
         raise SequenceError(
             f"{source} names no depth image; expected depth_file_path in its frames: process the "
@@ -75,7 +79,8 @@ def list_frames(contents: Contents) -> Listed:
         read_pose=read,
         calibration=_calibration(about, frames, files, source),
         findings=(
-            *_left_out(len(depth) - len(kept)),
+            *_left_out(depth.count(None)),
+            *_repeated(len(depth) - depth.count(None) - len(kept)),
             *_without_colors(frames, files, source),
             *_distorted(about, frames, source),
         ),
@@ -183,6 +188,13 @@ def _left_out(count: int) -> tuple[Finding, ...]:
     if not count:
         return ()
     return (Finding(f"{count} frames have no depth image", "They are left out."),)
+
+
+def _repeated(count: int) -> tuple[Finding, ...]:
+    if not count:
+        return ()
+    advice = "They are left out; list each depth image once."
+    return (Finding(f"{count} frames name the depth image of an earlier frame", advice),)
 
 
 def _without_colors(

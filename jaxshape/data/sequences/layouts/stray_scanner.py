@@ -52,7 +52,8 @@ def list_frames(contents: Contents) -> Listed:
     turns = np.stack([columns[name] for name in ("qx", "qy", "qz", "qw")], axis=-1)
     T = from_quaternions(places, turns, source)
     color = partners(depth, color_images(contents))
-    confidence = partners(depth, files_in(contents, ("confidence",), (".png",)))
+    maps = files_in(contents, ("confidence",), (".png",))
+    confidence = partners(depth, maps)
 
     def read(index: int) -> Float[np.ndarray, "4 4"] | None:
         row = rows[index]
@@ -69,6 +70,7 @@ def list_frames(contents: Contents) -> Listed:
         findings=(
             *(_without_film(contents) if not any(color) else ()),
             *miscounted_poses([row >= 0 for row in rows], len(row_of)),
+            *(_without_confidence(confidence.count(None), len(depth)) if maps else ()),
         ),
     )
 
@@ -125,6 +127,17 @@ def _calibration(
             "numbers: export the recording again."
         )
     return Calibration(K[None], shape, "camera_matrix.csv")
+
+
+def _without_confidence(missing: int, count: int) -> tuple[Finding, ...]:
+    if not missing:
+        return ()
+    return (
+        Finding(
+            f"{missing} of {count} depth images have no confidence map of their number",
+            "All their depths are used, guesses too; copy the folder confidence/ again.",
+        ),
+    )
 
 
 def _without_film(contents: Contents) -> tuple[Finding, ...]:

@@ -31,6 +31,8 @@ _CALIBRATED = {
 """fx, fy, cx, cy of the benchmark's colour cameras, to which depth is registered, and the
 distortion of their lenses."""
 
+_ASSOCIATED = re.compile(r"^(\S+\.\w+)\s+[\d.]+\s+\S+\.\w+$")
+
 
 def fits(contents: Contents) -> bool:
     return "depth.txt" in contents.files
@@ -66,10 +68,15 @@ def list_frames(contents: Contents) -> Listed:
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
-    """Sorted times, and images, of lines `time file`; a few lines may be in another order."""
+    """Sorted times, and images, of lines `time file`; a few lines may be in another order.
+
+    Of lines `time file time file`, as `associate.py` of the benchmark writes them, the first half
+    is read.
+    """
     try:
         words = [line.split(maxsplit=1) for line in reading.read_text(path).splitlines()]
-        pairs = [(float(w[0]), w[1].strip()) for w in words if w and not w[0].startswith("#")]
+        words = [w for w in words if w and not w[0].startswith("#")]
+        pairs = [(float(time), _ASSOCIATED.sub(r"\1", file.strip())) for time, file in words]
         if not np.isfinite([time for time, _ in pairs]).all():
             raise ValueError("a time is not finite")
     except (OSError, ValueError, IndexError) as error:
