@@ -36,8 +36,8 @@ from jaxshape.data.sequences.frames import Frame as Frame
 from jaxshape.data.sequences.frames import FrameFiles as FrameFiles
 from jaxshape.data.sequences.frames import Sequence as Sequence
 from jaxshape.data.sequences.frames import SequenceError as SequenceError
-from jaxshape.data.sequences.frames import first_shape, read_shape, same_aspect, size
 from jaxshape.data.sequences.frames import read_depth as read_depth
+from jaxshape.data.sequences.frames import read_shape, same_aspect, size, usual_shape
 from jaxshape.data.sequences.layouts import (
     arrays,
     bop,
@@ -229,10 +229,10 @@ def _may_fit(folder: Path) -> bool:
 
 
 def _shape_of(listed: Listed) -> tuple[int, int]:
-    """Height and width of the first depth image whose header can be read."""
+    """Height and width of most of the first depth images whose headers can be read."""
     depth = [files.depth for files in listed.files]
     # If none can be read, the first one says why.
-    return first_shape(depth, limits.DEPTH_PIXELS) or read_shape(depth[0], limits.DEPTH_PIXELS)
+    return usual_shape(depth, limits.DEPTH_PIXELS) or read_shape(depth[0], limits.DEPTH_PIXELS)
 
 
 def _cameras(
@@ -267,8 +267,8 @@ def _camera(
 def _without_other_colors(
     listed: Listed, shape: tuple[int, int]
 ) -> tuple[tuple[FrameFiles, ...], tuple[Finding, ...]]:
-    """Leave out all colour images, if the first has another aspect than the depth images."""
-    seen = first_shape(files.color for files in listed.files if files.color) or shape
+    """Leave out all colour images, if most of the first ones are of another aspect than depth."""
+    seen = usual_shape(files.color for files in listed.files if files.color) or shape
     if same_aspect(seen, shape):
         return listed.files, ()
     finding = Finding(

@@ -1,5 +1,6 @@
 """Frames of an RGB-D recording, read and checked one at a time, on request."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -243,8 +244,8 @@ def read_raw_depth(path: Picture, shape: tuple[int, int]) -> Float[np.ndarray, "
     with opened(path, limits.DEPTH_PIXELS) as image:
         if (image.height, image.width) != shape:
             raise SequenceError(
-                f"{path} is {_size_of(image)} pixels; expected {size(shape)} as the first depth "
-                "image: scale it to that size, or remove it."
+                f"{path} is {_size_of(image)} pixels; expected {size(shape)} as most of the "
+                "first depth images: scale it to that size, or remove it."
             )
         if getattr(image, "is_animated", False):
             raise SequenceError(
@@ -420,14 +421,21 @@ def read_shape(path: Picture, most: int = limits.COLOR_PIXELS) -> tuple[int, int
         return image.height, image.width
 
 
-def first_shape(
+def usual_shape(
     pictures: Iterable[Picture], most: int = limits.COLOR_PIXELS
 ) -> tuple[int, int] | None:
-    """Height and width of the first of up to 20 images whose header can be read, if any."""
-    for picture in islice(pictures, 20):
+    """The height and width that most of the first images have, whose headers can be read, if any.
+
+    The first five that can be read count, of up to 20 images.
+    """
+    shapes = Counter(islice(_shapes(islice(pictures, 20), most), 5))
+    return shapes.most_common(1)[0][0] if shapes else None
+
+
+def _shapes(pictures: Iterable[Picture], most: int) -> Iterator[tuple[int, int]]:
+    for picture in pictures:
         with suppress(SequenceError):
-            return read_shape(picture, most)
-    return None
+            yield read_shape(picture, most)
 
 
 def size(shape: tuple[int, int]) -> str:

@@ -179,12 +179,19 @@ def _log_text(trajectory: Trajectory) -> str:
 
 def _read_json(text: str) -> Trajectory:
     parameters = reading.parse_json(text)["parameters"]
-    by_columns = reading.numbers_of([one["extrinsic"] for one in parameters], (-1, 4, 4))
-    T_camera_world = np.swapaxes(by_columns, 1, 2)
+    by_columns = [_extrinsic(i, one["extrinsic"]) for i, one in enumerate(parameters)]
+    T_camera_world = np.swapaxes(np.reshape(by_columns, (-1, 4, 4)), 1, 2)
     finite = np.isfinite(T_camera_world).all(axis=(1, 2))
     T = np.full_like(T_camera_world, np.nan)
     T[finite] = np.linalg.inv(T_camera_world[finite])  # a singular one raises a ValueError
     return Trajectory(T, np.arange(len(T)))
+
+
+def _extrinsic(index: int, value: Any) -> Float[np.ndarray, "4 4"]:
+    try:
+        return reading.numbers_of(value, (4, 4))
+    except ValueError as error:
+        raise ValueError(f"the extrinsic of pose {index}: {error}") from None
 
 
 def _json_text(trajectory: Trajectory, camera: Pinhole) -> str:

@@ -494,6 +494,18 @@ def test_a_first_image_that_is_damaged_does_not_hide_the_others(tmp_path):
     assert open_sequence(tmp_path)[1].depth.any()
 
 
+@pytest.mark.parametrize("kind", ["depth", "color"])
+def test_a_first_image_of_another_size_costs_its_frame_alone(tmp_path, kind):
+    write_open3d(tmp_path, SEEN)
+    small = Image.open(tmp_path / kind / f"{kind}_0.png").resize((W // 4, H // 2))
+    small.save(tmp_path / kind / f"{kind}_0.png")
+    sequence = open_sequence(tmp_path)
+    assert sequence.shape == (H, W) and not sequence.findings
+    with pytest.raises(SequenceError, match=f"{kind}_0.png is 16 x 24 pixels; expected 64 x 48"):
+        sequence[0]
+    assert sequence[1].color is not None
+
+
 def test_ten_thousand_frames_open_at_once_and_unread(tmp_path, monkeypatch):
     (tmp_path / "depth").mkdir()
     (tmp_path / "rgb").mkdir()

@@ -101,6 +101,14 @@ def test_json_as_open3d_writes_it(tmp_path):
     assert texts[0] == texts[1]
 
 
+def test_a_missing_extrinsic_is_the_one_that_is_named(tmp_path):
+    good = {"extrinsic": np.eye(4).ravel().tolist()}
+    content = {"parameters": [good, {"extrinsic": None}, good]}
+    (tmp_path / "camera.json").write_text(json.dumps(content))
+    with pytest.raises(SequenceError, match="the extrinsic of pose 1: None is not a number"):
+        read_trajectory(tmp_path / "camera.json")
+
+
 def test_a_written_log_is_open3ds_text(tmp_path):
     write_trajectory(tmp_path / "way.log", Trajectory(QUARTER[None], np.array([4])))
     text = (tmp_path / "way.log").read_text()

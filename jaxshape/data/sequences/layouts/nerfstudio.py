@@ -13,9 +13,9 @@ from jaxshape.data.sequences.frames import (
     Finding,
     FrameFiles,
     SequenceError,
-    first_shape,
     read_shape,
     usual_depth_scale,
+    usual_shape,
 )
 from jaxshape.data.sequences.listing import (
     COLOR_SUFFIXES,
@@ -165,7 +165,7 @@ def _shape(entries: list[dict[str, Any]], files: list[FrameFiles], source: Path)
         )
     if (given := shapes.pop()) is not None:
         return given
-    return first_shape(one.color for one in files if one.color) or read_shape(files[0].depth)
+    return usual_shape(one.color for one in files if one.color) or read_shape(files[0].depth)
 
 
 def _numbers(entry: dict[str, Any], shape: tuple[int, int], source: Path) -> list[float]:

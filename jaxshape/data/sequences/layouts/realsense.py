@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxshape.data.sequences.errors import SequenceError
-from jaxshape.data.sequences.frames import FrameFiles, first_shape
+from jaxshape.data.sequences.frames import FrameFiles, usual_shape
 from jaxshape.data.sequences.listing import Contents, Listed, with_colors_by_time
 from jaxshape.data.sequences.rasters import Stored
 
@@ -70,7 +70,7 @@ def _timed(contents: Contents, pattern: re.Pattern[str]) -> _Timed:
 def _shape(depth: list[Path], color: list[Path]) -> tuple[int, int]:
     """Height and width of raw depth images, from the first whose size fits."""
     shapes = [(height, width) for width, height in _SIZES]
-    if (seen := first_shape(color)) is not None:
+    if (seen := usual_shape(color)) is not None:
         shapes.insert(0, seen)
     sizes = [path.stat().st_size for path in depth[:20]]
     for size in sizes:

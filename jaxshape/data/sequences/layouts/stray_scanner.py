@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxshape.data.sequences.cameras import Calibration, matrices_of
 from jaxshape.data.sequences.documents import read_document, rows_of
-from jaxshape.data.sequences.frames import Finding, SequenceError, first_shape
+from jaxshape.data.sequences.frames import Finding, SequenceError, usual_shape
 from jaxshape.data.sequences.listing import (
     Contents,
     Listed,
@@ -114,7 +114,7 @@ def _calibration(
     contents: Contents, columns: dict[str, np.ndarray], rows: list[int], color: list[Path | None]
 ) -> Calibration | None:
     """The camera of each frame, or else the common camera; both for images of the film's size."""
-    shape = first_shape(path for path in color if path) or _FILM
+    shape = usual_shape(path for path in color if path) or _FILM
     own = [columns[name][rows] for name in _OWN_CAMERA if name in columns]
     if len(own) == 4 and min(rows) >= 0 and np.isfinite(own).all():
         return Calibration(matrices_of(*own), shape, "odometry.csv, of each frame its own")
