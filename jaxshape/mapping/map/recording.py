@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxshape import checks
 from jaxshape.data.sequences import Sequence, SequenceError
 from jaxshape.mapping.map.cutting import cut_all, cut_new, is_outgrown, parts_in
 from jaxshape.mapping.map.mapper import Mapper
@@ -114,8 +115,11 @@ def follow(
 
     Yields:
         The progress after each frame.
+
+    Raises:
+        ValueError: A chosen number is not that of a frame.
     """
-    chosen = range(start.index, len(sequence)) if chosen is None else chosen
+    chosen = chosen_frames(sequence, chosen, start.index)
     progress = earlier or _begin(sequence, start, mapper, use_poses)
     if earlier is None:
         yield progress
@@ -126,6 +130,28 @@ def follow(
         if progress.logs[-1].status == "keyframe":
             progress = _placed_anew(progress, mapper, prior)
         yield progress
+
+
+def chosen_frames(
+    sequence: Sequence, chosen: Iterable[int] | None, first: int
+) -> tuple[int, ...] | range:
+    """Numbers of the frames to use, each checked to be in the recording.
+
+    Args:
+        sequence: The recording.
+        chosen: Numbers of the frames; None for all from the first on.
+        first: Number of the first frame, from 0.
+
+    Raises:
+        ValueError: A chosen number is not that of a frame.
+    """
+    if chosen is None:
+        return range(first, len(sequence))
+    chosen = tuple(chosen)
+    for index in chosen:
+        why = f"the recording has {len(sequence)} frames"
+        checks.whole("chosen", index, 0, len(sequence) - 1, why)
+    return chosen
 
 
 def _begin(sequence: Sequence, start: Start, mapper: Mapper, use_poses: bool) -> Progress:

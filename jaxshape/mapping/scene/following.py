@@ -22,7 +22,14 @@ from jaxshape.data.boxes import Box
 from jaxshape.data.sequences import Sequence
 from jaxshape.geometry.grids import Grids
 from jaxshape.mapping.map.mapper import placed_in
-from jaxshape.mapping.map.recording import Followed, FrameLog, Progress, advance, as_figures
+from jaxshape.mapping.map.recording import (
+    Followed,
+    FrameLog,
+    Progress,
+    advance,
+    as_figures,
+    chosen_frames,
+)
 from jaxshape.mapping.map.several import Member, Parts, finish_all, refine_all
 from jaxshape.mapping.map.state import grids_of
 from jaxshape.mapping.placement.finding import Start, first_readable, room
@@ -103,10 +110,13 @@ def follow_scene(
 
     Yields:
         The scene after each frame.
+
+    Raises:
+        ValueError: A chosen number is not that of a frame.
     """
+    every = chosen_frames(sequence, chosen, first)
     begun, scene = _begin(sequence, classes, first, use_poses)
     yield scene
-    every = range(begun, len(sequence)) if chosen is None else chosen
     for index in (i for i in every if i > begun):
         scene = _next(sequence, index, classes, scene, use_poses)
         yield scene

@@ -216,6 +216,12 @@ def test_only_the_chosen_frames_count(followed, folder):
     assert len(progress.state.keyframes) == 3
 
 
+@pytest.mark.parametrize("chosen", [[0, 99], [-1], [0, 1.5]])
+def test_a_chosen_frame_that_is_not_there_is_refused(unchecked_types, followed, folder, chosen):
+    with pytest.raises(ValueError, match=r"chosen is [-\d.]+; give a whole number, 0 "):
+        followed(folder, chosen=chosen, use_poses=True)
+
+
 def test_points_outside_the_mask_are_not_the_object(followed, copy, given, known):
     """With half of the masks blacked out, what is left is what the masks show."""
     indices = [log.index for log in given.logs if log.status == "keyframe"]
