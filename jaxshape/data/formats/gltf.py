@@ -1,10 +1,10 @@
 """glTF 2.0: every triangle of the scene that a viewer would show, in its resting pose."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 from jaxshape.data.formats.gltf_data import GltfFile, draco_mesh, open_gltf
 from jaxshape.data.formats.parts import (
@@ -37,6 +37,9 @@ _NAMES = 32
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _NO_SURFACE = (0, 1, 2, 3)
 """Modes of points and lines."""
+
+_USUAL = np.zeros((1, 3)), np.array([[0.0, 0, 0, 1]]), np.ones((1, 3))
+"""Translation, rotation and scale of a node that states none."""
 
 Matrix = Float[np.ndarray, "4 4"]
 
@@ -71,11 +74,11 @@ def read_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> list[Par
         if not meshes[key]:
             continue
         is_bent = "skin" in node  # then its joints place it
-        count, instances = (1, [np.eye(4)]) if is_bent else _instances(file, node)
-        faces += count * sum(len(part.faces) for part in meshes[key])
+        instances = _USUAL if is_bent else _instances(file, node)
+        faces += len(instances[0]) * sum(len(part.faces) for part in meshes[key])
         check_faces(faces)
-        copies = [np.eye(4) if is_bent else placed[index] @ instance for instance in instances]
-        parts += [_moved(part, names, matrix) for part in meshes[key] for matrix in copies]
+        copies = np.eye(4)[None] if is_bent else placed[index] @ _transform(*instances)
+        parts += [_moved(part, names, copies) for part in meshes[key]]
     return parts
 
 
@@ -110,23 +113,31 @@ def _matrix(node: dict[str, Any]) -> Matrix:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     return _transform(
-        node.get("translation", (0, 0, 0)),
-        node.get("rotation", (0, 0, 0, 1)),
-        node.get("scale", (1, 1, 1)),
+        *(
+            np.asarray(node.get(name, usual)).reshape(usual.shape[1])
+            for name, usual in zip(("translation", "rotation", "scale"), _USUAL, strict=True)
+        )
     )
 
 
-def _transform(translation: Any, xyzw: Any, scale: Any) -> Matrix:
-    """Matrix that scales, then rotates, then translates."""
-    x, y, z, w = np.asarray(xyzw, np.float64) / (np.linalg.norm(xyzw) or 1.0)
+def _transform(
+    translation: Num[np.ndarray, "*batch 3"],
+    xyzw: Num[np.ndarray, "*batch 4"],
+    scale: Num[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Matrices that scale, then rotate, then translate."""
+    xyzw = xyzw.astype(np.float64)
+    length = np.linalg.norm(xyzw, axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(xyzw / np.where(length == 0, 1, length), -1, 0)
     rotation = np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ])  # fmt: skip
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation * np.asarray(scale, np.float64)
-    matrix[:3, 3] = translation
+    matrix = np.zeros((*x.shape, 4, 4))
+    matrix[..., :3, :3] = np.moveaxis(rotation, (0, 1), (-2, -1)) * scale[..., None, :]
+    matrix[..., :3, 3] = translation
+    matrix[..., 3, 3] = 1
     return matrix
 
 
@@ -149,16 +160,20 @@ def _shown(file: GltfFile) -> Iterator[tuple[int, list[str]]]:
         waiting += [(child, names) for child in reversed(node.get("children", []))]
 
 
-def _instances(file: GltfFile, node: dict[str, Any]) -> tuple[int, Iterable[Matrix]]:
-    """Number of copies of a node's mesh, and their transforms in the frame of the node."""
+def _instances(file: GltfFile, node: dict[str, Any]) -> tuple[np.ndarray, ...]:
+    """Translations, rotations and scales of the copies of a node's mesh, in the frame of the
+    node."""
     about = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
     if about is None:
-        return 1, [np.eye(4)]
+        return _USUAL
     given = {name: file.accessor(i) for name, i in about["attributes"].items()}
     count = max(map(len, given.values()), default=0)
-    usual = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}
-    rows = [given.get(name, np.tile(value, (count, 1))) for name, value in usual.items()]
-    return count, (_transform(*row) for row in zip(*rows, strict=True))
+    rows = []
+    for name, usual in zip(("TRANSLATION", "ROTATION", "SCALE"), _USUAL, strict=True):
+        rows.append(given.get(name, np.broadcast_to(usual, (count, usual.shape[1]))))
+        if rows[-1].shape != (count, usual.shape[1]):
+            raise Unreadable("The attributes of the instances of a mesh do not fit each other.")
+    return tuple(rows)
 
 
 # ------------------------------------------------------------------ meshes
@@ -241,8 +256,13 @@ def _bent(
     return moved
 
 
-def _moved(part: Part, names: list[str], matrix: Matrix) -> Part:
-    """The part in the frame of the scene; its triangles keep the side that they face."""
-    vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-    faces = part.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else part.faces
-    return Part("/".join(filter(None, [*names, part.name])), vertices, faces)
+def _moved(part: Part, names: list[str], matrices: Float[np.ndarray, "n 4 4"]) -> Part:
+    """All copies of the part in the frame of the scene; their triangles keep the side that they
+    face."""
+    linear, count = matrices[:, :3, :3], len(part.vertices)
+    vertices = part.vertices @ np.swapaxes(linear, 1, 2) + matrices[:, None, :3, 3]
+    mirrored = (np.linalg.det(linear) < 0)[:, None, None]
+    faces = np.where(mirrored, part.faces[:, ::-1], part.faces)
+    faces += count * np.arange(len(matrices))[:, None, None]
+    name = "/".join(filter(None, [*names, part.name]))
+    return Part(name, vertices.reshape(-1, 3), faces.reshape(-1, 3))

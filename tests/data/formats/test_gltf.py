@@ -1,6 +1,7 @@
 """What changes shapes in a glTF is read as the specification says, or refused by name."""
 
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -81,6 +82,33 @@ def test_instances_stand_where_the_extension_puts_them():
     parts = read(one(gltf.tetrahedron(), gltf, **node))
     expected = [Part("", 2 * (CORNERS + place), FACES) for place in places]
     np.testing.assert_array_equal(triangles(parts), triangles(expected))
+
+
+def test_hundreds_of_thousands_of_instances_are_read_at_once():
+    """A few hundred bytes can state them."""
+    gltf = Gltf()
+    nothing = {"bufferView": gltf.view(bytes(4)), "componentType": 5125}
+    places = gltf.array(
+        np.zeros((1, 3), np.float32), count=300_000,
+        sparse={"count": 0, "indices": nothing, "values": nothing},
+    )  # fmt: skip
+    del gltf.header["accessors"][places]["bufferView"]
+    about = {"attributes": {"TRANSLATION": places}}
+    node = {"extensions": {"EXT_mesh_gpu_instancing": about}, "scale": [-1, 1, 1]}
+    start = time.process_time()
+    (part,) = read(one(gltf.tetrahedron(), gltf, **node))
+    assert time.process_time() - start < 2
+    assert part.vertices.shape == part.faces.shape == (1_200_000, 3)
+    last = Part("", part.vertices[-4:] * [-1, 1, 1], part.faces[-4:, ::-1] - 1_199_996)
+    np.testing.assert_array_equal(triangles([last]), WHOLE)
+
+
+def test_attributes_of_instances_have_one_length():
+    gltf = Gltf()
+    attributes = {"TRANSLATION": gltf.array(CORNERS), "SCALE": gltf.array(CORNERS[:3])}
+    node = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}}}
+    with pytest.raises(Unreadable, match="instances of a mesh do not fit"):
+        read(one(gltf.tetrahedron(), gltf, **node))
 
 
 def test_too_many_instances_are_refused_before_they_are_made():
