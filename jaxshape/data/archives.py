@@ -14,6 +14,7 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
+from jaxshape.data.formats.parts import Unreadable
 from jaxshape.limits import MESH_BYTES
 
 MESH_SUFFIXES = (".obj", ".off", ".ply", ".glb", ".gltf", ".stl")
@@ -245,7 +246,8 @@ def read_bytes(source: MeshSource, relative: str | None = None) -> bytes:
             itself.
 
     Raises:
-        ValueError: `relative` leaves the folder or the archive.
+        FileNotFoundError: There is no such file.
+        Unreadable: `relative` leaves the folder or the archive.
         TooLarge: The file is larger than `MAX_BYTES`.
     """
     path = Path(source.path)
@@ -275,6 +277,8 @@ def _archive(path: str, modified: int, size: int) -> zipfile.ZipFile:
 
 
 def _read_member(archive: zipfile.ZipFile, member: str) -> bytes:
+    if member not in archive.NameToInfo:
+        raise FileNotFoundError(f"There is no file {member!r} in the archive.")
     with archive.open(member) as stream:
         return _read(stream.read, member)
 
@@ -282,7 +286,7 @@ def _read_member(archive: zipfile.ZipFile, member: str) -> bytes:
 def _below(name: str) -> str:
     path = PurePosixPath(posixpath.normpath(name.replace("\\", "/")))
     if path.is_absolute() or path.parts[:1] == ("..",):
-        raise ValueError(f"The mesh refers to {name!r}, outside its own folder; it is not read.")
+        raise Unreadable(f"The mesh refers to {name!r}, outside its own folder; it is not read.")
     return str(path)
 
 

@@ -141,7 +141,7 @@ def load(
         return Skipped(source.name, "too large", str(problem))
     except NotSupported as problem:
         return Skipped(source.name, "not supported", str(problem))
-    except Unreadable as problem:
+    except (Unreadable, FileNotFoundError) as problem:
         return Skipped(source.name, "unreadable", str(problem))
     except Exception as problem:  # parsers of foreign files may raise anything
         detail = " ".join(f"{type(problem).__name__}: {problem}".split())

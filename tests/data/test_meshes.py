@@ -1,5 +1,6 @@
 import os
 import pickle
+import re
 import tracemalloc
 import zipfile
 
@@ -334,6 +335,19 @@ def test_a_mesh_cannot_refer_to_files_outside_its_folder(tmp_path):
     (tmp_path / "inside" / "model.gltf").write_bytes(header)
     skipped = one(tmp_path / "inside")
     assert skipped.reason == "unreadable" and "outside its own folder" in skipped.detail
+    assert skipped.detail.startswith("The mesh refers to")
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+def test_a_buffer_that_is_missing_is_named(tmp_path, is_packed):
+    header = trimesh.Scene(asymmetric()).export(file_type="gltf")["model.gltf"]
+    if is_packed:
+        archive(tmp_path / "a.zip", {"inside/model.gltf": header})
+    else:
+        (tmp_path / "model.gltf").write_bytes(header)
+    skipped = one(tmp_path)
+    assert skipped.reason == "unreadable"
+    assert re.fullmatch(r"There is no file '[^']*\.bin' (next to|in) the \w+\.", skipped.detail)
 
 
 def test_members_that_inflate_too_far_are_too_large(tmp_path, monkeypatch):

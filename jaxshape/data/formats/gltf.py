@@ -14,6 +14,7 @@ from jaxshape.data.formats.parts import (
     Unreadable,
     check_faces,
     checked,
+    damaged_at,
 )
 from jaxshape.data.formats.ply import strip_triangles
 
@@ -57,28 +58,31 @@ def read_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> list[Par
         TooManyFaces: There are too many triangles.
     """
     file = open_gltf(content, read_relative)
-    for name in file.list("extensionsRequired"):
+    for name in map(str, file.list("extensionsRequired")):
         if name not in UNDERSTOOD and not name.startswith(HARMLESS):
             raise NotSupported(f"The file needs the glTF extension {name}; export it without.")
     placed = _matrices(file)
+    with damaged_at("scenes"):
+        shown = list(_shown(file))
     meshes: dict[Any, list[Part]] = {}
     parts, faces = [], 0
-    for index, names in _shown(file):
+    for index, names in shown:
         node = file.list("nodes")[index]
         if "mesh" not in node:
             continue
-        key = index if "skin" in node or "weights" in node else ("mesh", node["mesh"])
-        if key not in meshes:
-            made = _primitives(file, node, placed)
-            meshes[key] = [part for part in made if len(part.faces)]
-        if not meshes[key]:
-            continue
-        is_bent = "skin" in node  # then its joints place it
-        instances = _USUAL if is_bent else _instances(file, node)
-        faces += len(instances[0]) * sum(len(part.faces) for part in meshes[key])
-        check_faces(faces)
-        copies = np.eye(4)[None] if is_bent else placed[index] @ _transform(*instances)
-        parts += [_moved(part, names, copies) for part in meshes[key]]
+        with damaged_at(f"nodes[{index}]"):
+            key = index if "skin" in node or "weights" in node else ("mesh", node["mesh"])
+            if key not in meshes:
+                made = _primitives(file, node, placed)
+                meshes[key] = [part for part in made if len(part.faces)]
+            if not meshes[key]:
+                continue
+            is_bent = "skin" in node  # then its joints place it
+            instances = _USUAL if is_bent else _instances(file, node)
+            faces += len(instances[0]) * sum(len(part.faces) for part in meshes[key])
+            check_faces(faces)
+            copies = np.eye(4)[None] if is_bent else placed[index] @ _transform(*instances)
+            parts += [_moved(part, names, copies) for part in meshes[key]]
     return parts
 
 
@@ -89,12 +93,15 @@ def _matrices(file: GltfFile) -> list[Matrix]:
     """Transforms from the frame of each node to the frame of the scene."""
     nodes = file.list("nodes")
     parents: dict[int, int] = {}
+    placed = []
     for i, node in enumerate(nodes):
-        for child in node.get("children", []):
-            if child in parents or not 0 <= child < len(nodes):
-                raise Unreadable(f"Node {child} is the child of two nodes, or is not there.")
-            parents[child] = i
-    placed = [_matrix(node) for node in nodes]
+        with damaged_at(f"nodes[{i}]"):
+            placed.append(_matrix(node))
+            for child in node.get("children", []):
+                is_there = isinstance(child, int) and 0 <= child < len(nodes)
+                if child in parents or not is_there:
+                    raise Unreadable(f"Node {child} is the child of two nodes, or is not there.")
+                parents[child] = i
     waiting = [i for i in range(len(nodes)) if i not in parents]
     seen = 0
     while waiting:
@@ -153,8 +160,10 @@ def _shown(file: GltfFile) -> Iterator[tuple[int, list[str]]]:
     while waiting:
         index, above = waiting.pop()
         node = file.entry("nodes", index)
-        if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
-            continue
+        with damaged_at(f"nodes[{index}]"):
+            visibility = node.get("extensions", {}).get("KHR_node_visibility", {})
+            if not visibility.get("visible", True):
+                continue
         names = [*above, str(node.get("name", ""))[:LETTERS]][-_NAMES:]
         yield index, names
         waiting += [(child, names) for child in reversed(node.get("children", []))]
@@ -182,18 +191,19 @@ def _instances(file: GltfFile, node: dict[str, Any]) -> tuple[np.ndarray, ...]:
 def _primitives(file: GltfFile, node: dict[str, Any], placed: list[Matrix]) -> Iterator[Part]:
     """The parts of a node's mesh, in the frame of the node or, if it has a skin, of the scene."""
     mesh = file.entry("meshes", node["mesh"])
-    weights = node.get("weights", mesh.get("weights", []))
-    for primitive in mesh["primitives"]:
-        if primitive.get("mode", _TRIANGLES) in _NO_SURFACE:
-            continue
-        attributes, faces = _arrays(file, primitive)
-        vertices = attributes["POSITION"].astype(np.float64)
-        for weight, target in zip(weights, primitive.get("targets", []), strict=False):
-            if weight and "POSITION" in target:
-                vertices = vertices + weight * file.accessor(target["POSITION"])
-        if "skin" in node:
-            vertices = _bent(file, node["skin"], placed, attributes, vertices)
-        yield checked(Part(str(mesh.get("name", ""))[:LETTERS], vertices, faces))
+    with damaged_at(f"meshes[{node['mesh']}]"):
+        weights = node.get("weights", mesh.get("weights", []))
+        for primitive in mesh["primitives"]:
+            if primitive.get("mode", _TRIANGLES) in _NO_SURFACE:
+                continue
+            attributes, faces = _arrays(file, primitive)
+            vertices = attributes["POSITION"].astype(np.float64)
+            for weight, target in zip(weights, primitive.get("targets", []), strict=False):
+                if weight and "POSITION" in target:
+                    vertices = vertices + weight * file.accessor(target["POSITION"])
+            if "skin" in node:
+                vertices = _bent(file, node["skin"], placed, attributes, vertices)
+            yield checked(Part(str(mesh.get("name", ""))[:LETTERS], vertices, faces))
 
 
 def _arrays(

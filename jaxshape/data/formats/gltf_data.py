@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxshape import reading
-from jaxshape.data.formats.parts import NotSupported, Unreadable
+from jaxshape.data.formats.parts import NotSupported, Unreadable, damaged_at
 from jaxshape.limits import MESH_BYTES
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -30,7 +30,10 @@ class GltfFile(NamedTuple):
 
     def list(self, name: str) -> list[Any]:
         """An array of the header, such as its `nodes`; empty where it is missing."""
-        return self.header.get(name, [])
+        entries = self.header.get(name, [])
+        if not isinstance(entries, list):
+            raise Unreadable(f"The header of the file is damaged at {name}, which is no list.")
+        return entries
 
     def entry(self, name: str, index: Any) -> Any:
         """The entry of an array of the header that has an index, which is 0 or more.
@@ -44,12 +47,16 @@ class GltfFile(NamedTuple):
         """
         entries = self.list(name)
         if not isinstance(index, int) or not 0 <= index < len(entries):
-            raise Unreadable(f"The file refers to {name}[{index}], which it does not have.")
+            raise Unreadable(f"The file refers to {name}[{index!s:.40}], which it does not have.")
         return entries[index]
 
     def accessor(self, index: int) -> np.ndarray:
         """Numbers `[count width]` of an accessor; normalized integers are converted to floats."""
         about = self.entry("accessors", index)
+        with damaged_at(f"accessors[{index}]"):
+            return self._accessor(about, index)
+
+    def _accessor(self, about: dict[str, Any], index: int) -> np.ndarray:
         kind, width, count = _TYPES[about["componentType"]], _WIDTHS[about["type"]], about["count"]
         if not 0 <= count * width * np.dtype(kind).itemsize <= MESH_BYTES:
             raise Unreadable(f"An accessor says that it has {count} entries.")
@@ -82,8 +89,8 @@ class GltfFile(NamedTuple):
 
     def view(self, index: int, kind: str, width: int, count: int, start: int) -> np.ndarray:
         """Numbers `[count width]` of a buffer view, from the byte `start` on."""
-        about, size = self.entry("bufferViews", index), np.dtype(kind).itemsize
-        content, row = self.view_bytes(index), about.get("byteStride", width * size)
+        content, size = self.view_bytes(index), np.dtype(kind).itemsize
+        row = self.entry("bufferViews", index).get("byteStride", width * size)
         if start < 0 or row < 1 or start + (count - 1) * row + width * size > len(content):
             raise Unreadable(f"Buffer view {index} ends before the numbers that it should hold.")
         return (
@@ -95,15 +102,16 @@ class GltfFile(NamedTuple):
     def view_bytes(self, index: int) -> bytes:
         """All bytes of a buffer view."""
         about = self.entry("bufferViews", index)
-        content = self.buffers[about["buffer"]]
-        if "EXT_meshopt_compression" in about.get("extensions", {}) or content is None:
-            raise NotSupported(
-                "The file is compressed by EXT_meshopt_compression; export it without."
-            )
-        start, length = about.get("byteOffset", 0), about["byteLength"]
-        if start < 0 or length < 0 or start + length > len(content):
-            raise Unreadable(f"Buffer view {index} reaches beyond its buffer.")
-        return content[start : start + length]
+        with damaged_at(f"bufferViews[{index}]"):
+            content = self.buffers[about["buffer"]]
+            if "EXT_meshopt_compression" in about.get("extensions", {}) or content is None:
+                raise NotSupported(
+                    "The file is compressed by EXT_meshopt_compression; export it without."
+                )
+            start, length = about.get("byteOffset", 0), about["byteLength"]
+            if start < 0 or length < 0 or start + length > len(content):
+                raise Unreadable(f"Buffer view {index} reaches beyond its buffer.")
+            return content[start : start + length]
 
 
 def open_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> GltfFile:
@@ -126,14 +134,22 @@ def open_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> GltfFile
         raise Unreadable(f"The header of the file cannot be read: {problem}.") from problem
     if not isinstance(header, dict):
         raise Unreadable("The file is no glTF: its JSON is no object.")
-    version = str(header.get("asset", {}).get("version", "2.0"))
+    with damaged_at("asset"):
+        version = str(header.get("asset", {}).get("version", "2.0"))
     if not version.startswith("2."):
         raise NotSupported(f"The file is of glTF {version}; export glTF 2.0.")
-    buffers = [
-        _buffer(about, binary if i == 0 else None, read_relative)
-        for i, about in enumerate(header.get("buffers", []))
-    ]
-    return GltfFile(header, buffers)
+    file = GltfFile(header, [])
+    for i, about in enumerate(file.list("buffers")):
+        with damaged_at(f"buffers[{i}]"):
+            uri, length = about.get("uri"), about["byteLength"]
+            content = _inside(uri, binary if i == 0 else None)
+        if content is None and uri is not None:
+            content = _file(uri, read_relative)
+        with damaged_at(f"buffers[{i}]"):
+            if content is not None and len(content) < length:
+                raise Unreadable(f"A buffer has {len(content)} bytes, but the file says {length}.")
+        file.buffers.append(content)
+    return file
 
 
 def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
@@ -157,24 +173,18 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
     return chunks[_JSON], chunks.get(_BINARY)
 
 
-def _buffer(
-    about: dict[str, Any], binary: bytes | None, read_relative: Callable[[str], bytes]
-) -> bytes | None:
-    uri, length = about.get("uri"), about["byteLength"]
-    if uri is None and binary is None:
-        return None  # a placeholder for the data that an extension unpacks
+def _inside(uri: str | None, binary: bytes | None) -> bytes | None:
+    """The content of a buffer that is inside the file.
+
+    None for a buffer in another file, and for a placeholder for data that an extension unpacks.
+    """
     if uri is None:
-        content = binary
-    elif uri.startswith("data:"):
-        head, _, text = uri.partition(",")
-        raw = urllib.parse.unquote_to_bytes(text)
-        content = base64.b64decode(raw) if head.endswith(";base64") else raw
-    else:
-        content = _file(uri, read_relative)
-    assert content is not None
-    if len(content) < length:
-        raise Unreadable(f"A buffer has {len(content)} bytes, but the file says {length}.")
-    return content
+        return binary
+    if not uri.startswith("data:"):
+        return None
+    head, _, text = uri.partition(",")
+    raw = urllib.parse.unquote_to_bytes(text)
+    return base64.b64decode(raw) if head.endswith(";base64") else raw
 
 
 def referred(content: bytes) -> list[str]:

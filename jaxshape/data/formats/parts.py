@@ -1,6 +1,8 @@
 """The results and errors of all readers of mesh files."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +42,24 @@ class NotSupported(ValueError):
 
 class TooManyFaces(ValueError):
     """A file holds more than `MAX_FACES` triangles."""
+
+
+@contextmanager
+def damaged_at(place: str) -> Iterator[None]:
+    """Refuse a file in one sentence where a block finds a value of a wrong kind in its header.
+
+    Args:
+        place: Where the header is then damaged, such as `nodes[3]`.
+
+    Raises:
+        Unreadable: The block ended in an error that is not one of a reader.
+    """
+    try:
+        yield
+    except (Unreadable, NotSupported, TooManyFaces):
+        raise
+    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError) as problem:
+        raise Unreadable(f"The header of the file is damaged at {place}.") from problem
 
 
 def check_faces(count: int) -> None:

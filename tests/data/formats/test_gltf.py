@@ -1,7 +1,9 @@
 """What changes shapes in a glTF is read as the specification says, or refused by name."""
 
+import json
 import sys
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -257,6 +259,56 @@ def test_names_of_buffers_may_be_encoded(uri):
     np.testing.assert_array_equal(triangles(parts), WHOLE)
 
 
+WORST = (None, True, "x", {}, [], [None], -1, 0.5, 1e300, float("nan"))
+"""What stands in a header where something else should."""
+
+
+def test_anything_in_place_of_anything_ends_in_a_sentence_or_parts():
+    """Every entry, by everything that is none, one at a time."""
+    gltf = Gltf(scenes=[{"nodes": [0]}], scene=0, extensionsRequired=["EXT_mesh_gpu_instancing"])
+    target = {"POSITION": gltf.array(CORNERS)}
+    mesh = {"name": "a", "primitives": [gltf.tetrahedron(targets=[target])], "weights": [0.5]}
+    about = {"attributes": {"TRANSLATION": gltf.array(CORNERS)}}
+    node = {"mesh": 0, "children": [1], "extensions": {"EXT_mesh_gpu_instancing": about}}
+    gltf.header |= {"meshes": [mesh], "nodes": [node, {"translation": [1, 2, 3]}]}
+    content = json.loads(gltf.content())
+    for path in entries(content):
+        for worst in WORST:
+            text = json.dumps(changed(content, path, worst)).encode()
+            with suppress(Unreadable, NotSupported, TooManyFaces), np.errstate(all="ignore"):
+                read_gltf(text, lambda name: b"")
+
+
+def entries(content, path=()):
+    """Places of all entries of a JSON content."""
+    inside = content.items() if isinstance(content, dict) else enumerate(content)
+    for key, value in inside:
+        yield (*path, key)
+        if isinstance(value, dict | list):
+            yield from entries(value, (*path, key))
+
+
+def changed(content, path, value):
+    """A copy of a JSON content with another entry in one place."""
+    if not path:
+        return value
+    copy = dict(content) if isinstance(content, dict) else list(content)
+    copy[path[0]] = changed(copy[path[0]], path[1:], value)
+    return copy
+
+
+def _null(gltf):
+    gltf.header["nodes"] = None
+
+
+def _text(gltf):
+    gltf.header["asset"] = "x"
+
+
+def _no_children(gltf):
+    gltf.header["nodes"][0]["children"] = None
+
+
 def _cut(gltf):
     gltf.data = gltf.data[:-8]
 
@@ -289,6 +341,9 @@ def _odd(gltf):
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
+        (_null, "The header of the file is damaged at nodes, which is no list."),
+        (_text, "The header of the file is damaged at asset."),
+        (_no_children, r"The header of the file is damaged at nodes\[0\]."),
         (_cut, "beyond its buffer"),
         (_circle, "their own descendants"),
         (_two_parents, "child of two nodes"),
