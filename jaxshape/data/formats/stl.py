@@ -9,6 +9,9 @@ from jaxshape.data.formats.parts import Part, Unreadable, check_faces, positions
 _HEADER, _FACE = 84, 50
 """Bytes before the first triangle of a binary file, and of each triangle."""
 
+_NAME = re.compile(r"^(\s*(?:end)?solid\b).*?(?=\bfacet\s+normal\b|$)", re.MULTILINE)
+"""The name of a solid, which may be made of any words, after the word that it follows."""
+
 
 def read_stl(content: bytes) -> list[Part]:
     """The triangles of an STL file.
@@ -38,7 +41,7 @@ def _binary(content: bytes, count: int) -> Part:
 
 
 def _text(text: str) -> Part:
-    text = text.lower()
+    text = _NAME.sub(r"\1 ", text.lower())
     words = text.split()
     corners = [words[i + 1 : i + 4] for i, word in enumerate(words) if word == "vertex"]
     facets, ends = len(re.findall(r"\bfacet\s+normal\b", text)), words.count("endfacet")

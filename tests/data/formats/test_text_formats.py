@@ -142,6 +142,11 @@ def test_stl_is_whole_or_refused():
     for content in (binary, b"solid " + binary[6:], text, *others):
         (part,) = read_stl(content)
         np.testing.assert_allclose(part.vertices[part.faces], BOX.triangles, atol=1e-6)
+    named = text.replace(b"solid", b"solid vertex of a facet")  # at the beginning and the end
+    line = text.replace(b"solid", b"solid vertex of a facet", 1).replace(b"\n", b" ")
+    for content in (named, line):
+        (part,) = read_stl(content)
+        np.testing.assert_allclose(part.vertices[part.faces], BOX.triangles, atol=1e-6)
     for content in (binary[:-50], binary + binary[-50:], text[: len(text) // 2]):
         with pytest.raises(Unreadable, match="does not fit|not whole"):
             read_stl(content)
