@@ -11,6 +11,7 @@ import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from jaxtyping import Float
 from jaxshape.data.archives import MeshSource, TooLarge, list_meshes, read_bytes
 from jaxshape.data.config import UNITS, UnitName, check_axes
 from jaxshape.data.formats import read_parts
-from jaxshape.data.formats.gltf_data import referred
+from jaxshape.data.formats.gltf_data import read_buffer, referred
 from jaxshape.data.formats.parts import NotSupported, TooManyFaces, Unreadable
 from jaxshape.data.helpers import without_helpers
 from jaxshape.data.orientation import SEAT, apparent_up, up_scores
@@ -154,7 +155,7 @@ def _parse(source: MeshSource, up: str) -> tuple[trimesh.Trimesh, tuple[str, ...
     if not content.strip(b"\0 \t\r\n"):
         raise _Unusable("empty", "The file has no content.")
     suffix = os.path.splitext(source.member or source.path)[1].lower()
-    parts = read_parts(suffix, content, lambda name: read_bytes(source, name))
+    parts = read_parts(suffix, content, partial(read_bytes, source))
     if not any(len(part.vertices) for part in parts):
         raise _Unusable("empty", "The file holds no vertices of a triangle mesh.")
     parts, notes = without_helpers(parts, up)
@@ -200,22 +201,31 @@ def digest(source: MeshSource) -> str:
     """
     content = read_bytes(source)
     found = hashlib.sha256(content)
-    for name in referred(content):
+    for uri in referred(content):
         with suppress(Exception):  # missing or broken files are reported when they are read
-            found.update(read_bytes(source, name))
+            found.update(read_buffer(uri, partial(read_bytes, source)))
     about = sorted(source.metadata.items()), source.axes
     found.update(repr(about).encode("utf-8", "surrogateescape"))
     return found.hexdigest()
 
 
 def _apply_catalogue(mesh: trimesh.Trimesh, metadata: dict[str, str]) -> None:
-    """Rotate and scale a catalogue's model: +y up, front +z, `width` x `height` x `depth` cm."""
+    """Rotate and scale a catalogue's model: +y up, front +z, `width` x `height` x `depth` cm.
+
+    Raises:
+        _Unusable: Its rotation or its size leaves it without a finite extent along an axis.
+    """
     if "modelRotation" in metadata:
         rotation = np.array(metadata["modelRotation"].split(), float).reshape(3, 3)
         mesh.vertices = mesh.vertices @ rotation.T
     sizes = [metadata.get(field) for field in ("width", "height", "depth")]
-    if all(sizes):
-        mesh.vertices *= np.array(sizes, float) / 100 / mesh.extents
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if all(sizes):
+            mesh.vertices *= np.array(sizes, float).clip(min=0) / 100 / mesh.extents
+        extents = mesh.extents
+    if not FLAT * extents.max() < extents.min() < np.inf:
+        size = " x ".join(f"{extent:.3g}" for extent in extents)
+        raise _Unusable("flat", f"By its catalogue, the mesh measures {size} m.")
 
 
 def canonical(mesh: trimesh.Trimesh, *, up: str = "y", front: str = "z") -> trimesh.Trimesh:

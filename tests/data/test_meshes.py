@@ -207,6 +207,25 @@ def test_a_furniture_catalogue_turns_scales_and_credits(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "width#1=0",
+        "depth#1=NaN",
+        "height#1=-4",
+        "height#1=inf",
+        "modelRotation#1=0 0 0 0 1 0 0 0 1",
+    ],
+)
+def test_a_size_of_a_catalogue_that_nothing_has_is_refused(tmp_path, line):
+    obj = asymmetric().export(file_type="obj")
+    properties = CATALOGUE + line + "\n"  # the last line of a name counts
+    members = {"PluginFurnitureCatalog.properties": properties, "oak/oak.obj": obj}
+    skipped = one(archive(tmp_path / "kit.sh3f", members))
+    assert skipped.reason == "flat"
+    assert skipped.detail.startswith("By its catalogue, the mesh measures")
+
+
 # Axes
 
 
@@ -426,6 +445,26 @@ def test_a_digest_knows_the_content_and_not_the_name(tmp_path):
     buffer = min((tmp_path / "two").glob("*.bin"))
     buffer.write_bytes(buffer.read_bytes()[:-1] + b"\x01")
     assert digest(one_) != digest(two)
+
+
+@pytest.mark.parametrize("kind", ["blank", "glb", "encoded"])
+def test_a_digest_knows_every_buffer(tmp_path, kind):
+    files = trimesh.Scene(asymmetric()).export(file_type="gltf")
+    header = b" " * (kind == "blank") + files.pop("model.gltf")
+    for name, content in files.items():
+        uri = name.replace("_", "%20")
+        header = header.replace(name.encode(), uri.encode())
+        (tmp_path / (uri if kind == "encoded" else uri.replace("%20", " "))).write_bytes(content)
+    if kind == "glb":
+        header += b" " * (-len(header) % 4)
+        sizes = np.array([2, 20 + len(header), len(header)], "<u4").tobytes()
+        header = b"glTF" + sizes + b"JSON" + header
+    (tmp_path / f"model.{'glb' if kind == 'glb' else 'gltf'}").write_bytes(header)
+    (source,) = list_meshes(tmp_path)
+    assert isinstance(load(source), Model)
+    before, buffer = digest(source), min(tmp_path.glob("*.bin"))
+    buffer.write_bytes(buffer.read_bytes() + b"more")
+    assert digest(source) != before
 
 
 # Sampling

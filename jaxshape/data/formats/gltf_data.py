@@ -1,6 +1,7 @@
 """The numbers of a glTF file: its chunks, buffers, accessors and Draco meshes."""
 
 import base64
+import re
 import urllib.parse
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -144,7 +145,7 @@ def open_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> GltfFile
             uri, length = about.get("uri"), about["byteLength"]
             content = _inside(uri, binary if i == 0 else None)
         if content is None and uri is not None:
-            content = _file(uri, read_relative)
+            content = read_buffer(uri, read_relative)
         with damaged_at(f"buffers[{i}]"):
             if content is not None and len(content) < length:
                 raise Unreadable(f"A buffer has {len(content)} bytes, but the file says {length}.")
@@ -188,23 +189,31 @@ def _inside(uri: str | None, binary: bytes | None) -> bytes | None:
 
 
 def referred(content: bytes) -> list[str]:
-    """Names of the files that a `.gltf` file refers to for its shapes; none for any other file.
+    """Names of the files that a `.gltf` or `.glb` file refers to for its shapes, as it states them;
+    none for any other file.
 
     Args:
         content: All of the file.
     """
-    if content[:1] != b"{" and content[:4] != b"\xef\xbb\xbf{":
-        return []
     try:
+        if content[:4] == b"glTF":
+            content, _ = _chunks(content)
+        if not re.match(rb"(\xef\xbb\xbf)?\s*\{", content):
+            return []
         header = reading.parse_json(content.decode("utf-8-sig"))
         uris = [about.get("uri", "data:") for about in header.get("buffers", [])]
-    except (ValueError, AttributeError):  # the reader of the file reports this
+        return [uri for uri in uris if not uri.startswith("data:")]
+    except (ValueError, TypeError, AttributeError):  # the reader of the file reports this
         return []
-    return [urllib.parse.unquote(uri) for uri in uris if not uri.startswith("data:")]
 
 
-def _file(uri: str, read_relative: Callable[[str], bytes]) -> bytes:
-    """A file next to the mesh: `with%20space.bin` is `with space.bin`."""
+def read_buffer(uri: str, read_relative: Callable[[str], bytes]) -> bytes:
+    """Read a file next to the mesh: `with%20space.bin` is `with space.bin`.
+
+    Args:
+        uri: Name of the file, as the mesh states it.
+        read_relative: Reads a file by its path relative to the mesh.
+    """
     name = urllib.parse.unquote(uri)
     try:
         return read_relative(name)
