@@ -132,7 +132,7 @@ def problems(
     found = packaged_set() if problem_set is None else problem_set
     checks.instance("problem_set", found, ProblemSet, "read_set")
     count = len(found.objects) if objects is None else objects
-    is_count = isinstance(count, Integral) and count >= 1
+    is_count = isinstance(count, Integral) and 1 <= count <= len(found.objects)
     if not (is_count and _are_among(frames, FRAMES) and _are_among(kinds, KINDS)):
         raise ValueError(
             f"{found.name} has no matching problem; give objects from 1 to {len(found.objects)},"

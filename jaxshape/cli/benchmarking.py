@@ -32,8 +32,8 @@ class Bench:
     output: Path = Path("board")
     """Folder for one file for each method, and for board.md, board.png and board.html. Existing
     results are kept, and not computed again."""
-    objects: int = 24
-    """Number of objects, starting with the first of the set."""
+    objects: int | None = None
+    """Number of objects, starting with the first of the set; by default all."""
     frames: str = ",".join(map(str, FRAMES))
     """Numbers of fused frames, separated by commas, among 1, 4 and 8."""
     kinds: tuple[KindName, ...] = KINDS

@@ -70,6 +70,7 @@ def test_problems_belong_to_their_weights(packaged, tiny_set, linear_prior):
         {"kinds": ("clean", "dirty")},
         {"objects": 1.5},
         {"objects": 0},
+        {"objects": 2},
     ],
 )
 def test_no_part_of_a_choice_is_dropped(unchecked_types, tiny_set, linear_prior, asked):
