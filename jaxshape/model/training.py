@@ -449,9 +449,18 @@ def read_metrics(folder: str | os.PathLike[str]) -> list[Report]:
     if not path.exists():
         return []
     try:
-        return [Report(**reading.parse_json(line)) for line in reading.read_text(path).splitlines()]
+        return [_report(line) for line in reading.read_text(path).splitlines()]
     except (OSError, ValueError, TypeError) as problem:
         raise ValueError(f"{str(path)!r} is damaged ({problem}); remove it.") from problem
+
+
+def _report(line: str) -> Report:
+    report = Report(**reading.parse_json(line))
+    for name, value in report._asdict().items():
+        is_missing = value is None and name.startswith("validation")
+        if not (is_missing or isinstance(value, int | float)):
+            raise ValueError(f"a {name} is {value!r:.60}, not a number")
+    return report
 
 
 def _record(folder: Path, report: Report) -> None:

@@ -269,6 +269,14 @@ def test_metrics_on_disk_are_the_reports(whole_run, tmp_path):
     assert read_metrics(tmp_path) == []
 
 
+@pytest.mark.parametrize("name, value", [("step", "4"), ("step", None), ("loss", [1])])
+def test_metrics_that_are_no_numbers_are_named(whole_run, tmp_path, name, value):
+    lines = [json.dumps(report._asdict() | {name: value}) for report in whole_run.reports]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=f"metrics.jsonl' is damaged .a {name} is .*not a number"):
+        read_metrics(tmp_path)
+
+
 def test_a_finished_run_has_nothing_left_to_do(dataset, whole_run, start):
     before = (whole_run.folder / "checkpoint.safetensors").read_bytes()
     assert list(training.train(whole_run.folder, dataset, CONFIG, load_prior(start))) == []
