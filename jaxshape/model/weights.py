@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from jaxshape import limits, reading
+from jaxshape import checks, limits, reading
 from jaxshape.files import atomic_path
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.autoencoder import AUTOENCODER
@@ -152,8 +152,11 @@ def load_prior(
     Raises:
         WeightsError: The file is missing, damaged, not in this format, or of an unknown kind of
             model; or its arrays are not finite, or do not fit its model.
+        ValueError: An argument is of another type.
     """
     where = _path(path)
+    if model is not None:
+        checks.instance("model", model, ShapeModel, "ShapeModel(...)")
     tensors, metadata = _read(where)
     found = _model(metadata.get("kind", AUTOENCODER.kind), model, where)
     mean, covariance = tensors.pop("code_mean", None), tensors.pop("code_covariance", None)
@@ -256,7 +259,9 @@ def unflatten(named: dict[str, Any]) -> PyTree:
 
 
 def _path(path: str | os.PathLike[str] | None) -> Path:
-    name = "chair" if path is None else os.fspath(path)
+    name = "chair" if path is None else path
+    if not (isinstance(name, str | os.PathLike) and os.fspath(name)):
+        checks.refuse("path", path, f"a weights file, or one of {', '.join(PACKAGED)}")
     if name in PACKAGED:
         return Path(str(resources.files("jaxshape.model") / f"{name}.safetensors"))
     return Path(name)

@@ -37,12 +37,18 @@ def one_key_each(keys: Key[Array, "*object"], count: int) -> Key[Array, " object
         count: Number of objects.
 
     Raises:
-        ValueError: There are neither as many keys as objects nor one.
+        ValueError: There are neither as many keys as objects nor one, or they are no keys.
     """
     if not hasattr(keys, "dtype"):
         raise ValueError(f"keys is {keys!r}; give random keys, as jax.random.key(0).")
     if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
-        keys = jax.random.wrap_key_data(keys)
+        try:
+            keys = jax.random.wrap_key_data(keys)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"keys are {keys.dtype} numbers of shape {keys.shape}; give random keys, as "
+                "jax.random.key(0)."
+            ) from None
     if keys.ndim == 0:
         return jax.random.split(keys, count)
     if keys.shape != (count,):

@@ -135,6 +135,8 @@ def refine(
             checks.refuse(name, function, "a function, or None")
     if previous is not None:
         checks.instance("previous", previous, Refined, "refine")
+    if targets is None:
+        checks.refuse("targets", targets, "the targets of all objects, jax.vmap(residual.target)")
     if previous is not None and warm_start is not None:
         raise ValueError(
             "Both previous and warm_start are given; give previous to go on with the same targets,"

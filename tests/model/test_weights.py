@@ -96,6 +96,18 @@ def test_a_missing_file_is_named(load, tmp_path):
         load(tmp_path / "nowhere.safetensors")
 
 
+@pytest.mark.parametrize("load", [load_prior, load_card])
+@pytest.mark.parametrize("path", [5, "", b"chair"])
+def test_a_path_that_is_none_is_refused(unchecked_types, load, path):
+    with pytest.raises(ValueError, match=f"path is {path!r}; give a weights file, or one of"):
+        load(path)
+
+
+def test_a_model_that_is_none_is_refused(unchecked_types, saved):
+    with pytest.raises(ValueError, match="model is of type str; give a ShapeModel"):
+        load_prior(saved, "x")
+
+
 @pytest.mark.parametrize("kept", [0, 7, 200, -1])
 def test_a_truncated_file_is_named(kept, saved, tmp_path):
     path = tmp_path / "half.safetensors"

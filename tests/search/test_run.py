@@ -343,6 +343,8 @@ def test_one_key_is_one_for_each_object(counted):
     "keys, codes, said",
     [
         (KEYS[:2], CODES, r"keys of shape \(2,\) for 3 objects; give one for each"),
+        (jnp.zeros(3, jnp.uint32), CODES, r"keys are uint32 numbers of shape \(3,\); give random"),
+        (jnp.zeros((3, 2)), CODES, r"keys are float32 numbers of shape \(3, 2\); give random"),
         (KEYS[:1], CODES[0], r"codes have shape \(4,\); give \[object, 4\].*code\[None\]"),
         (KEYS, CODES[:, :3], r"codes have shape \(3, 3\); give \[object, 4\]"),
     ],
@@ -390,6 +392,7 @@ def test_a_search_that_breaks_its_promise_is_told_which(counted, name, change, s
             {"first_losses": 1.0},
             r"first_losses has an array of shape \(\), but there are 3 objects",
         ),
+        ({"targets": None}, r"targets is None; give the targets of all objects, jax.vmap\("),
         ({"penalty_weight": -1.0}, "penalty_weight is -1.0; give a number, 0 or more"),
         ({"target_loss": float("nan")}, "target_loss is nan; give a number"),
         ({"space": "raw"}, "space is of type str; give a LatentSpace, as whitened"),
