@@ -143,13 +143,13 @@ def open_gltf(content: bytes, read_relative: Callable[[str], bytes]) -> GltfFile
     for i, about in enumerate(file.list("buffers")):
         with damaged_at(f"buffers[{i}]"):
             uri, length = about.get("uri"), about["byteLength"]
-            content = _inside(uri, binary if i == 0 else None)
-        if content is None and uri is not None:
-            content = read_buffer(uri, read_relative)
+            inside = _inside(uri, binary if i == 0 else None)
+        if inside is None and uri is not None:
+            inside = read_buffer(uri, read_relative)
         with damaged_at(f"buffers[{i}]"):
-            if content is not None and len(content) < length:
-                raise Unreadable(f"A buffer has {len(content)} bytes, but the file says {length}.")
-        file.buffers.append(content)
+            if inside is not None and len(inside) < length:
+                raise Unreadable(f"A buffer has {len(inside)} bytes, but the file says {length}.")
+        file.buffers.append(inside)
     return file
 
 
