@@ -259,9 +259,10 @@ def unflatten(named: dict[str, Any]) -> PyTree:
 
 
 def _path(path: str | os.PathLike[str] | None) -> Path:
-    name = "chair" if path is None else path
-    if not (isinstance(name, str | os.PathLike) and os.fspath(name)):
+    given = "chair" if path is None else path
+    if not (isinstance(given, str | os.PathLike) and os.fspath(given)):
         checks.refuse("path", path, f"a weights file, or one of {', '.join(PACKAGED)}")
+    name = os.fspath(given)
     if name in PACKAGED:
         return Path(str(resources.files("jaxshape.model") / f"{name}.safetensors"))
     return Path(name)

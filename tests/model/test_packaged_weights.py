@@ -1,6 +1,7 @@
 """The weights that come with the package: they load for ever, and they do their job."""
 
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from jaxshape.model.autoencoder import architecture_of
 from jaxshape.model.completion import COMPLETION
 from jaxshape.model.config import Architecture
 from jaxshape.model.shapes import decode, encode
-from jaxshape.model.weights import load_card, load_prior
+from jaxshape.model.weights import PACKAGED, fingerprint, load_card, load_prior
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct, refiner_for
 
@@ -46,6 +47,12 @@ def observed():
 def test_they_have_the_default_architecture_and_a_card(prior):
     assert architecture_of(prior.params) == Architecture()
     assert load_card("chair-autoencoder")["licence"] == "Apache-2.0"
+
+
+@pytest.mark.parametrize("name", PACKAGED)
+def test_their_names_are_paths_too(name):
+    """The command line gives every name as a path."""
+    assert fingerprint(load_prior(Path(name))) == fingerprint(load_prior(name))
 
 
 def test_codes_of_chairs_lie_where_the_stored_statistics_say(prior, observed):
