@@ -100,15 +100,12 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def read_json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The object in a JSON file; raises as `read_json` does, and `ValueError` for other content.
+    """The object in a JSON file; raises as `read_text` and `parse_json_object` do.
 
     Args:
         path: The file.
     """
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise ValueError(f"it holds a JSON {type(content).__name__}, not an object")
-    return content
+    return parse_json_object(read_text(path, limits.JSON_BYTES))
 
 
 def parse_json(text: str) -> Any:
@@ -128,6 +125,37 @@ def parse_json(text: str) -> Any:
         return json.loads(text, parse_int=_whole)
     except ValueError as error:
         raise ValueError(f"it is not JSON: {error}") from None
+
+
+def parse_json_object(text: str) -> dict[str, Any]:
+    """The object in a JSON text; raises as `parse_json` does, and `ValueError` for other content.
+
+    Args:
+        text: The text.
+    """
+    content = parse_json(text)
+    if not isinstance(content, dict):
+        raise ValueError(f"it holds a JSON {type(content).__name__}, not an object")
+    return content
+
+
+def wrong_kinds(
+    content: dict[str, Any], kinds: dict[str, type | tuple[type, ...]]
+) -> tuple[str, ...]:
+    """Names of the entries of a JSON object that are of another type; booleans are no numbers.
+
+    Args:
+        content: The object.
+        kinds: Type of each entry that it must have.
+
+    Raises:
+        KeyError: The object lacks an entry.
+    """
+    return tuple(
+        name
+        for name, kind in kinds.items()
+        if isinstance(content[name], bool) or not isinstance(content[name], kind)
+    )
 
 
 def _nesting(text: str) -> int:

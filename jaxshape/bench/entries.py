@@ -175,9 +175,8 @@ def _require_figures(row: Row) -> None:
 
 
 def _require(part: str, content: dict[str, Any]) -> None:
-    for name, kind in _KINDS[part].items():
-        if isinstance(content[name], bool) or not isinstance(content[name], kind):
-            raise ValueError(f"{name} is {content[name]!r:.60}")
+    if wrong := reading.wrong_kinds(content, _KINDS[part]):
+        raise ValueError(f"{wrong[0]} is {content[wrong[0]]!r:.60}")
 
 
 def read_entries(paths: Iterable[Path]) -> list[Entry]:

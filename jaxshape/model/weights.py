@@ -217,10 +217,7 @@ def load_card(path: str | os.PathLike[str] | None = None) -> dict[str, Any]:
     """
     where = _path(path)
     try:
-        card = reading.parse_json(_read(where)[1].get("card", "{}"))
-        if not isinstance(card, dict):
-            raise ValueError(f"it is a JSON {type(card).__name__}, not an object")
-        return card
+        return reading.parse_json_object(_read(where)[1].get("card", "{}"))
     except WeightsError:
         raise
     except ValueError as problem:

@@ -109,7 +109,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         content = reading.read_json_object(path)
         kinds = {"settings": dict, "rows": dict, "seconds": (int, float)}
-        if wrong := [name for name, kind in kinds.items() if not isinstance(content[name], kind)]:
+        if wrong := reading.wrong_kinds(content, kinds):
             raise ValueError(f"its {wrong[0]} are damaged")
         if not all(isinstance(row, dict) for row in content["rows"].values()):
             raise ValueError("one of its rows is damaged")
