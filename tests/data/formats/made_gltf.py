@@ -41,6 +41,15 @@ class Gltf:
         self.header["accessors"].append(about | entries)
         return len(self.header["accessors"]) - 1
 
+    def origins(self, count):
+        """Add an accessor that states a number of points at 0 in a few bytes; returns its
+        number."""
+        nothing = {"bufferView": self.view(bytes(4)), "componentType": 5125}
+        about = {"componentType": 5126, "type": "VEC3", "count": count}
+        sparse = {"count": 0, "indices": nothing, "values": nothing}
+        self.header["accessors"].append(about | {"sparse": sparse})
+        return len(self.header["accessors"]) - 1
+
     def tetrahedron(self, **entries):
         """A primitive of `CORNERS` and `FACES`."""
         return {

@@ -7,6 +7,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from changed_json import changed
 from made_gltf import CORNERS, FACES, Gltf, triangles
 
 from jaxshape.data.formats.gltf import read_gltf
@@ -89,13 +90,7 @@ def test_instances_stand_where_the_extension_puts_them():
 def test_hundreds_of_thousands_of_instances_are_read_at_once():
     """A few hundred bytes can state them."""
     gltf = Gltf()
-    nothing = {"bufferView": gltf.view(bytes(4)), "componentType": 5125}
-    places = gltf.array(
-        np.zeros((1, 3), np.float32), count=300_000,
-        sparse={"count": 0, "indices": nothing, "values": nothing},
-    )  # fmt: skip
-    del gltf.header["accessors"][places]["bufferView"]
-    about = {"attributes": {"TRANSLATION": places}}
+    about = {"attributes": {"TRANSLATION": gltf.origins(300_000)}}
     node = {"extensions": {"EXT_mesh_gpu_instancing": about}, "scale": [-1, 1, 1]}
     start = time.process_time()
     (part,) = read(one(gltf.tetrahedron(), gltf, **node))
@@ -125,13 +120,7 @@ def test_too_many_instances_are_refused_before_they_are_made():
 def test_instances_without_a_face_are_passed_over():
     """A few bytes can state millions of them."""
     gltf = Gltf()
-    nothing = {"bufferView": gltf.view(bytes(4)), "componentType": 5125}
-    places = gltf.array(
-        np.zeros((1, 3), np.float32), count=40_000_000,
-        sparse={"count": 0, "indices": nothing, "values": nothing},
-    )  # fmt: skip
-    del gltf.header["accessors"][places]["bufferView"]
-    about = {"attributes": {"TRANSLATION": places}}
+    about = {"attributes": {"TRANSLATION": gltf.origins(40_000_000)}}
     node = {"extensions": {"EXT_mesh_gpu_instancing": about}}
     none = gltf.array(FACES.ravel(), count=0)
     assert read(one(gltf.tetrahedron(indices=none), gltf, **node)) == []
@@ -286,15 +275,6 @@ def entries(content, path=()):
         yield (*path, key)
         if isinstance(value, dict | list):
             yield from entries(value, (*path, key))
-
-
-def changed(content, path, value):
-    """A copy of a JSON content with another entry in one place."""
-    if not path:
-        return value
-    copy = dict(content) if isinstance(content, dict) else list(content)
-    copy[path[0]] = changed(copy[path[0]], path[1:], value)
-    return copy
 
 
 def _null(gltf):

@@ -8,6 +8,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from changed_json import changed
 from device_recordings import WRITERS, shoot
 from PIL import Image
 from recordings import record, save, write_7_scenes, write_open3d, write_tum
@@ -257,12 +258,3 @@ def entries(content, path=(), depth=3):
         content, list) else ()  # fmt: skip
     for key, value in inside if depth else ():
         yield from entries(value, (*path, key), depth - 1)
-
-
-def changed(content, path, value):
-    """A copy of a JSON content with another entry in one place."""
-    if not path:
-        return value
-    copy = dict(content) if isinstance(content, dict) else list(content)
-    copy[path[0]] = changed(copy[path[0]], path[1:], value)
-    return copy
