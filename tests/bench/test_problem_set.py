@@ -42,16 +42,26 @@ def test_a_set_that_was_written_is_the_same(packaged, tmp_path):
 
 
 def test_the_script_measures_what_is_stored(packaged):
-    """Up to voxels that rounding decides, which may differ between processors."""
+    """Up to voxels that rounding decides, which may differ between processors.
+
+    The noise is drawn edge by edge: one pixel more that rounding takes for an edge gives all later
+    pixels of this chair other noise. So noisy grids are the same for most chairs, not for each.
+    """
     sys.path.insert(0, str(ROOT / "experiments"))
     import bench_set
 
-    (chair,) = map(load_object, procedural_objects("chair", 1, TEST_SEEDS))
-    for kind, config in bench_set.KINDS.items():
-        case = observe(chair, config)
-        stored = packaged.measured[kind][0]
-        assert np.mean(pack_measured(case.grids) != stored) < 1e-3
-    assert np.mean(unpack(packaged.surfaces[0]) != case.surface[0]) < 1e-3
+    names = [one["name"] for one in packaged.objects]
+    chairs = [*map(load_object, procedural_objects("chair", 3, TEST_SEEDS))]
+    rows = [names.index(chair.name) for chair in chairs]
+    other = {kind: [] for kind in bench_set.KINDS}
+    for chair, row in zip(chairs, rows, strict=True):
+        for kind, config in bench_set.KINDS.items():
+            case = observe(chair, config)
+            stored = packaged.measured[kind][row]
+            other[kind].append(np.mean(pack_measured(case.grids) != stored))
+        assert np.mean(unpack(packaged.surfaces[row]) != case.surface[0]) < 1e-3
+    assert np.max(other["clean"]) < 1e-3
+    assert np.median(other["noisy"]) < 1e-3
 
 
 def test_problems_belong_to_their_weights(packaged, tiny_set, linear_prior):
