@@ -147,7 +147,9 @@ def move_the_box(folder):
     "damage, said",
     [
         (in_metres, "--depth-scale"),
-        (move_the_box, "Nothing was measured inside the object's box"),
+        pytest.param(
+            move_the_box, "Nothing was measured inside the object's box", marks=pytest.mark.slow
+        ),
         (lambda folder: (folder / "box.json").write_text("{"), "cannot be read as JSON"),
         (lambda folder: rewrite_box(folder, size=[1, -1, 1]), "expected positive extents"),
         (lambda folder: (folder / "camera-intrinsics.txt").unlink(), "is missing"),
@@ -740,6 +742,7 @@ def killed_after(function, count):
 STAGES = ((building, "build_dataset"), (training, "train"), (evaluation, "evaluate"))
 
 
+@pytest.mark.slow
 def test_own_category_in_one_command_however_often_it_is_killed(
     run, collection, tmp_path, monkeypatch, prior
 ):

@@ -73,7 +73,15 @@ def test_a_recording_without_faults(whole, walk):
     assert_tracked(whole, walk)
 
 
-@pytest.mark.parametrize("missing", [range(2, 14, 3), range(4, 9), range(3, 10), range(1, 13)])
+@pytest.mark.parametrize(
+    "missing",
+    [
+        range(2, 14, 3),
+        pytest.param(range(4, 9), marks=pytest.mark.slow),
+        pytest.param(range(3, 10), marks=pytest.mark.slow),
+        range(1, 13),
+    ],
+)
 def test_frames_are_missing(folder, walk, followed, missing):
     """Every third; a jump of 30, 40 and 65 degrees."""
     for i in missing:
@@ -156,7 +164,7 @@ def test_something_moves_in_front_of_the_object(tmp_path, walk, followed, whole)
     assert same_shape(progress, whole) > 0.97
 
 
-@pytest.mark.parametrize("factor", [0.95, 1.05])
+@pytest.mark.parametrize("factor", [0.95, pytest.param(1.05, marks=pytest.mark.slow)])
 def test_the_focal_length_is_wrong(folder, walk, followed, whole, factor):
     """The map is then a little larger or smaller, which nothing in it contradicts."""
     write_camera(folder, factor * FOCAL)
@@ -200,6 +208,7 @@ def test_no_frame_can_be_read(run, folder, tmp_path, compiled):
     assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["earlier"]
 
 
+@pytest.mark.slow
 def test_a_run_can_be_watched_killed_and_gone_on_with(
     run, folder, tmp_path, walk, compiled, monkeypatch
 ):

@@ -3,9 +3,12 @@
 import json
 from dataclasses import replace
 
+import pytest
+
 import measurement as script
 
 
+@pytest.mark.slow
 def test_measurement(linear_weights, tmp_path):
     config = replace(script.Config(), weights=linear_weights, smoke=True, results=tmp_path)
     script.main(config)

@@ -78,6 +78,7 @@ def test_every_chair_has_a_row_with_every_contestants_scores(journal, test_set):
             assert 0 < row[k]["F"]["occluded_empty"] < 1
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_an_evaluation(journal, test_set, linear_prior):
     from jaxshape.data.dataset import load_object
 

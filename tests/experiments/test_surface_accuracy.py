@@ -3,9 +3,12 @@
 import json
 from dataclasses import replace
 
+import pytest
+
 import surface_accuracy as script
 
 
+@pytest.mark.slow
 def test_surface_accuracy(linear_weights, tmp_path):
     script.main(replace(script.Config(), weights=linear_weights, smoke=True, results=tmp_path))
     content = json.loads((tmp_path / "surface_accuracy.json").read_text())

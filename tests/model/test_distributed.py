@@ -17,6 +17,8 @@ from safetensors.numpy import load_file
 from jaxshape.model import training
 from jaxshape.process import join_processes
 
+FLAGS = os.environ.get("XLA_FLAGS", "")
+
 
 @pytest.fixture(scope="module")
 def begin(start):
@@ -25,7 +27,7 @@ def begin(start):
     def begin(folder, *machines, devices=1):
         command = [sys.executable, tiny_training.__file__, folder, start, *machines]
         settings = {
-            "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+            "XLA_FLAGS": f"{FLAGS} --xla_force_host_platform_device_count={devices}",
             "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
         }
         return subprocess.Popen(

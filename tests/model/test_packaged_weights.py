@@ -64,7 +64,7 @@ def test_codes_of_chairs_lie_where_the_stored_statistics_say(prior, observed):
 @pytest.fixture(scope="module")
 def rebuilt(prior, observed):
     config = RefineConfig(iterations=30)
-    run = partial(reconstruct, refiner=refiner_for("cma", prior, config), config=config)
+    run = partial(reconstruct, refiner=refiner_for("gradient:adam", prior, config), config=config)
     return jax.jit(run)(jax.random.split(jax.random.key(0), CHAIRS), prior, *observed[:2])
 
 

@@ -18,12 +18,9 @@ from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import reconstruct_jit, refiner_for
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "encoder, decoder",
-    [
-        ((4, 8, 8), (8, 8)),
-        pytest.param((4, 8, 8, 16, 16), (16, 8, 8, 4), marks=pytest.mark.slow),
-    ],
+    "encoder, decoder", [((4, 8, 8), (8, 8)), ((4, 8, 8, 16, 16), (16, 8, 8, 4))]
 )
 def test_a_network_of_another_resolution_trains_refines_and_meshes(tmp_path, encoder, decoder):
     sizes = Architecture(encoder, decoder, 8)

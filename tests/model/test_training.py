@@ -154,6 +154,7 @@ def test_the_loss_weighs_occluded_voxels(first_step):
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_running_average_follows_the_parameters_slowly():
     config = replace(CONFIG, architecture=SMALL, average=0.9, bfloat16=False)
     state = initial_state(config)
@@ -371,7 +372,10 @@ def test_the_prior_of_a_completion_network_is_normal(dataset, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, prior.params, state.average)
 
 
-@pytest.mark.parametrize("architecture", [CONFIG.architecture, Completion((4, 4, 4), 1, 3)])
+@pytest.mark.parametrize(
+    "architecture",
+    [pytest.param(CONFIG.architecture, marks=pytest.mark.slow), Completion((4, 4, 4), 1, 3)],
+)
 def test_reports_score_the_objects_kept_out(monkeypatch, dataset, tmp_path, architecture):
     monkeypatch.setattr(training, "validation_size", lambda *_: 2)
     config = replace(CONFIG, architecture=architecture, steps=1, average=0.5)

@@ -100,6 +100,7 @@ def test_a_mesh_scores_the_same_alone_and_in_company(linear_prior, scores, model
         assert alone["frames"][k]["bounds"] == scores[2]["frames"][k]["bounds"]
 
 
+@pytest.mark.slow
 def test_a_search_finds_the_same_for_a_mesh_alone_and_in_company(linear_prior, scores, models):
     config = replace(CONFIG, methods=("cma",))
     (alone,) = evaluate(linear_prior, models[1:2], config)  # the second of its batch in company

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from four_devices import METHODS, OBJECTS
 
+FLAGS = os.environ.get("XLA_FLAGS", "")
+
 
 @pytest.fixture(scope="module")
 def found():
@@ -17,7 +19,7 @@ def found():
 
     def begin(devices):
         settings = {
-            "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+            "XLA_FLAGS": f"{FLAGS} --xla_force_host_platform_device_count={devices}",
             "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
         }
         command = [sys.executable, four_devices.__file__]

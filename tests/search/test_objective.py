@@ -68,6 +68,7 @@ def test_a_penalty_may_close_over_arrays_of_the_program(linear_prior):
     np.testing.assert_array_equal(found[1], 0)
 
 
+@pytest.mark.slow
 def test_a_line_search_over_the_network_can_be_batched(prior):
     """Its branches turn into selects, which copy whatever the network's program holds."""
     keys, codes = jax.random.split(jax.random.key(0), 2), jnp.zeros((2, 10))
@@ -115,7 +116,8 @@ def test_a_residual_of_ones_own_sees_the_objects_own_data(linear_prior):
         np.testing.assert_allclose(losses[i, k], expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_slopes_of_the_network_are_right_in_64_bits(prior, dtype):
     """Accumulators without a type of their own were float64, and every gradient an error."""
     grids = np.asarray(jax.random.bernoulli(jax.random.key(1), 0.3, (2, 32, 32, 32)), np.float32)

@@ -96,6 +96,7 @@ def test_the_fitted_calibration_is_the_one_that_made_the_outcomes():
     np.testing.assert_allclose(fit(logits, spread, occupied), true, atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_few_objects_give_no_calibration_and_more_make_surfaces_more_probable(linear_prior):
     codes = jax.random.normal(jax.random.key(2), (16, 10))
     grids = left_half_measured(linear_prior, codes)

@@ -173,6 +173,7 @@ def multimodal():
     return [search(*rows_of(disturbed)) for disturbed in (jnp.zeros(8, bool), jnp.arange(8) >= 4)]
 
 
+@pytest.mark.slow
 def test_solves_rastrigin_where_one_run_does_not(multimodal):
     (states, seen), _ = multimodal
     restarts, best = np.asarray(seen[1]), np.asarray(seen[5])
@@ -181,6 +182,7 @@ def test_solves_rastrigin_where_one_run_does_not(multimodal):
     assert np.sum(states.best.loss < 1e-5) >= 6
 
 
+@pytest.mark.slow
 def test_objects_restart_on_their_own(multimodal):
     (states, seen), (others, _) = multimodal
     restarts = np.asarray(seen[1])
@@ -188,6 +190,7 @@ def test_objects_restart_on_their_own(multimodal):
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[:4], y[:4]), states, others)
 
 
+@pytest.mark.slow
 def test_the_best_survives_restarts(multimodal):
     (states, seen), _ = multimodal
     best, trace = np.asarray(seen[5]), seen[-1]

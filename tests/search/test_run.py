@@ -25,7 +25,14 @@ TARGETS = weigh(
     jnp.tensordot(CODES, PARAMS, 1),
     LESS_FREE,
 )
-METHODS = ["cma", "gradient", "gradient:lbfgs", "evosax:SNES", "hybrid:adam", "gauss-newton"]
+METHODS = [
+    "cma",
+    "gradient",
+    "evosax:SNES",
+    "gauss-newton",
+    pytest.param("gradient:lbfgs", marks=pytest.mark.slow),
+    pytest.param("hybrid:adam", marks=pytest.mark.slow),
+]
 
 
 def searching(prior, method, iterations=ITERATIONS, config=CONFIG, **options):
@@ -223,6 +230,7 @@ def test_a_search_that_converged_stops_and_costs_no_quality(to_goal, counter, co
     assert np.all(found.loss < full.loss + 1e-4)
 
 
+@pytest.mark.slow
 def test_polishing_counts_towards_the_iterations_of_a_hybrid(counted):
     """CMA-ES stops early, the gradient goes on from there, and stops by its own criterion."""
     config = RefineConfig(population=6, sigma0=0.3, tolerance=1e-5, iterations=150)

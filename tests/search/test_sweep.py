@@ -26,7 +26,13 @@ GRIDS = {
 }
 
 
-@pytest.mark.parametrize("method", GRIDS)
+@pytest.mark.parametrize(
+    "method",
+    [
+        "gradient:adam",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("cma", "gauss-newton")),
+    ],
+)
 def test_a_grid_of_settings_over_objects_is_one_program(method, counter, counted):
     """It finds what one setting at a time finds, and other settings are no other program."""
     names, values = zip(*GRIDS[method].items(), strict=True)

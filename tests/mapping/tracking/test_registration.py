@@ -55,7 +55,7 @@ def relative(second):
 # ------------------------------------------------------------------ registration
 
 
-@pytest.mark.parametrize("azimuth", [0.5, -10, 10, 20])
+@pytest.mark.parametrize("azimuth", [pytest.param(0.5, marks=pytest.mark.slow), -10, 10, 20])
 def test_steps_of_up_to_twenty_degrees_are_found(azimuth):
     second = seen_from(azimuth, seed=1)
     found = register(prepare(second.depth, LENS), ALL, REFERENCE, STILL)
@@ -64,7 +64,7 @@ def test_steps_of_up_to_twenty_degrees_are_found(azimuth):
     assert found.converged and found.inlier_fraction > 0.8 and found.conditioning > 1e-3
 
 
-@pytest.mark.parametrize("azimuth", [45, -45])
+@pytest.mark.parametrize("azimuth", [pytest.param(45, marks=pytest.mark.slow), -45])
 def test_a_wide_step_needs_many_guesses(azimuth):
     second = seen_from(azimuth, seed=1)
     view, truth = prepare(second.depth, LENS), relative(second)

@@ -39,6 +39,7 @@ def lowered(name, by):
     assert left < by, left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", optimizers())
 def test_every_optimiser_of_optax_descends(name):
     """`dog` and `prodigy` begin with steps of 1e-6 and double them; the noise of `noisy_sgd` is
@@ -46,6 +47,7 @@ def test_every_optimiser_of_optax_descends(name):
     lowered(f"gradient:{name}", 1.0 if name in ("dog", "noisy_sgd", "prodigy") else 0.8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(distribution_based_algorithms))
 def test_every_strategy_of_evosax_descends(name):
     lowered(f"evosax:{name}", 0.95)

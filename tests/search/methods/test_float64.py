@@ -14,16 +14,16 @@ ITERATIONS = 12
 CONFIG = RefineConfig(iterations=ITERATIONS, population=6, sigma0=0.5, tolerance=1e-9)
 METHODS = [
     "cma",
-    "cma:ipop",
-    "cma:bipop",
+    pytest.param("cma:ipop", marks=pytest.mark.slow),
+    pytest.param("cma:bipop", marks=pytest.mark.slow),
     "gradient:adam",
     "gradient:lbfgs",
     "gradient:noisy_sgd",
     "gradient:prodigy",
     "evosax:CMA_ES",
-    "evosax:EvoTF_ES",
+    pytest.param("evosax:EvoTF_ES", marks=pytest.mark.slow),
     "evosax:Open_ES",
-    "hybrid",
+    pytest.param("hybrid", marks=pytest.mark.slow),
     "gauss-newton",
 ]
 

@@ -81,6 +81,7 @@ def test_a_damped_step_solves_the_damped_equations(about):
     np.testing.assert_allclose(promised, -slope @ step - step @ matrix @ step / 2, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_the_curvature_of_a_network_is_that_of_its_differences(prior):
     """Its layers have derivatives in reverse only. All of a batch share the calls."""
     codes = jnp.asarray(rng.normal(size=(3, D)), jnp.float32)

@@ -29,7 +29,14 @@ def search(name, config=CONFIG):
 
 
 @pytest.mark.parametrize(
-    "name", ["cma:ipop", "cma:bipop", "gradient:adam", "evosax:Sep_CMA_ES", "evosax:xNES"]
+    "name",
+    [
+        pytest.param("cma:ipop", marks=pytest.mark.slow),
+        pytest.param("cma:bipop", marks=pytest.mark.slow),
+        "gradient:adam",
+        "evosax:Sep_CMA_ES",
+        "evosax:xNES",
+    ],
 )  # the other names are those of `test_run.py`
 def test_every_name_gives_a_search_that_lowers_the_loss(name):
     states, traces = search(name)
