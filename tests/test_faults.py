@@ -156,6 +156,7 @@ def same_shape(ours, theirs):
     return (occupied & np.any(around, axis=0)).sum() / occupied.sum()
 
 
+@pytest.mark.slow
 def test_something_moves_in_front_of_the_object(tmp_path, walk, followed, whole):
     progress = followed(write_recording(tmp_path / "frames", record(occluder=True)))
     assert_tracked(progress, walk)
@@ -164,7 +165,8 @@ def test_something_moves_in_front_of_the_object(tmp_path, walk, followed, whole)
     assert same_shape(progress, whole) > 0.97
 
 
-@pytest.mark.parametrize("factor", [0.95, pytest.param(1.05, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.95, 1.05])
 def test_the_focal_length_is_wrong(folder, walk, followed, whole, factor):
     """The map is then a little larger or smaller, which nothing in it contradicts."""
     write_camera(folder, factor * FOCAL)

@@ -108,6 +108,7 @@ def test_the_camera_stands_in_proportion_to_the_objects_diagonal():
     np.testing.assert_allclose(camera_distance(box), 1.5 * 1.3)
 
 
+@pytest.mark.slow
 def test_frames_fused_in_one_go_and_one_after_the_other_are_the_same(ellipsoid):
     """The field of so many frames, its grids, and the grids after each number of frames."""
     sensor = sensor_of(CAMERAS["kinect"])

@@ -49,6 +49,7 @@ def test_mugs_differ_and_repeat():
     assert not np.allclose(first.extents, other.extents, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_smoke(tmp_path, linear_weights):
     config = mugs.Config(
         output=tmp_path / "mugs", weights=linear_weights, picture=tmp_path / "mugs.png", smoke=True

@@ -79,7 +79,8 @@ def test_boxes_become_a_mesh():
     assert mesh.bounds.mean(0) == pytest.approx([1, 2, 3])
 
 
-@pytest.mark.parametrize("with_boxes", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("with_boxes", [True, False])
 def test_smoke(tmp_path, with_boxes):
     (tmp_path / "cad").mkdir()
     for i, mesh in enumerate((table(), table(back=True), table(arms=True, back=True))):

@@ -84,6 +84,7 @@ def assert_same_weights(folder, whole_run, start):
     assert np.abs(moved).max() > 2e-3  # there was something to get wrong
 
 
+@pytest.mark.slow
 def test_two_devices_train_as_one(two_devices, whole_run, start):
     folder, found = two_devices
     assert_same_course(found["reports"], whole_run.reports)

@@ -109,6 +109,7 @@ def test_a_search_finds_the_same_for_a_mesh_alone_and_in_company(linear_prior, s
         assert ours == pytest.approx(theirs, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_frames_are_the_first_of_the_orbit(models):
     """More frames leave less occluded, and what one frame measured stays measured."""
     case = observe(models[0], AS_IN_THE_PAPER)
@@ -136,7 +137,13 @@ def test_points_are_those_that_all_frames_together_measure(models):
     np.testing.assert_array_equal(case.grids.occluded[0], fusion.occluded(merged))
 
 
-@pytest.mark.parametrize("name", ["kinect", "realsense", "iphone-lidar"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "kinect",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("realsense", "iphone-lidar")),
+    ],
+)
 def test_noisy_frames_are_fused_as_distances(models, name):
     """F and M are soft, as many frames know more than one, and they agree with the truth."""
     case = observe(models[0], replace(CONFIG, camera=name, frames=(1, 4)))

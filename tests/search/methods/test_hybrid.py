@@ -62,6 +62,7 @@ def test_the_gradient_begins_at_the_best_point_and_ends_at_least_as_low(found):
     assert np.all(sigma[:, HANDOVER:] == sigma[:, HANDOVER - 1 : HANDOVER])
 
 
+@pytest.mark.slow
 def test_it_reaches_the_floor_where_the_population_has_not():
     hybrid = polished(SEARCH, gradient(optax.lbfgs()), HANDOVER)
     _, trace = jax.jit(lambda: run_batch(hybrid, lambda: sphere, KEY, POINTS, ITERATIONS))()
