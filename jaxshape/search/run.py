@@ -168,7 +168,7 @@ def refine(
             exact = prepare_one(prior, rows.grids, "float32")
             how = how._replace(shared=(exact.shared, how.shared[1]))
             own = own._replace(features=exact.own)
-        code, logits, loss = _best(how, own, states, space)
+        code, logits, loss = _best(how, own, states, space, rows.codes)
         return Refined(
             code=code,
             logits=logits,
@@ -205,15 +205,22 @@ def _evaluation(prior, prepared, residual, penalty, codes, own) -> Evaluation:
 
 
 def _best(
-    how: Evaluation, own: ObjectTerms, states: Any, space: LatentSpace
+    how: Evaluation,
+    own: ObjectTerms,
+    states: Any,
+    space: LatentSpace,
+    first: Float[Array, "object d"],
 ) -> tuple[Float[Array, "object d"], Float[Array, "object x y z"], Float[Array, " object"]]:
     """Code, logits and objective of the best that each search has found.
 
     The final mean of a search was never evaluated: it is the mean of a population, or the point
-    after the last gradient step. It may be better than the best candidate.
+    after the last gradient step. It may be better than the best candidate. A search of your own may
+    lose its best candidate to NaN; the first code stands in for it.
     """
     points = jnp.stack([states.best.point, states.mean], axis=1)
     codes = jax.vmap(jax.vmap(space.to_code))(points)
+    is_code = jnp.all(jnp.isfinite(codes), axis=-1, keepdims=True)
+    codes = jnp.where(is_code, codes, first[:, None])
     count, two, d = codes.shape
     owner = jnp.repeat(jnp.arange(count), two)
     logits, losses = how.shape(how.shared, codes.reshape(-1, d), own, owner)

@@ -386,6 +386,21 @@ def test_a_search_that_breaks_its_promise_is_told_which(counted, name, change, s
         refine(KEYS, counted, CODES, TARGETS, refiner, 2)
 
 
+def lost(state, trace):
+    """The search has lost its way: its best candidate and its mean are NaN."""
+    nothing = jnp.full_like(state.mean, jnp.nan)
+    best = state.best._replace(point=nothing, loss=jnp.nan * state.best.loss)
+    return state._replace(best=best, mean=nothing), trace
+
+
+def test_a_search_that_loses_its_best_candidate_gives_the_first_code(counted):
+    refiner = GRADIENT._replace(step=lambda *given: lost(*GRADIENT.step(*given)))
+    found = refine(KEYS, counted, CODES, TARGETS, refiner, 2)
+    np.testing.assert_array_equal(found.code, CODES)
+    losses = [loss_of(CODES[i], i) for i in range(OBJECTS)]
+    np.testing.assert_allclose(found.loss, losses, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     "change, said",
     [
