@@ -45,12 +45,13 @@ cad_chairs: $(VENV)/.runtime
 # One process for each core. Most of their time goes into compiling, so they share compiled programs,
 # which also serve the next run, and use a generator of code that takes half the time, where JAX
 # still has it.
-GENERATOR := import jax; print("--xla_cpu_use_fusion_emitters=false" * (jax.__version_info__ < (0, 11)))
+GENERATOR := import jax; \
+	print("--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else "")
 
 test: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/out/compiled
 test: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
 test: $(VENV)/.develop
-	XLA_FLAGS="$$XLA_FLAGS $$($(BIN)/python -c '$(GENERATOR)')" OPENBLAS_NUM_THREADS=1 \
+	XLA_FLAGS="$${XLA_FLAGS-$$($(BIN)/python -c '$(GENERATOR)')}" OPENBLAS_NUM_THREADS=1 \
 		$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(VENV)/.develop
