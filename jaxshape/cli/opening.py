@@ -77,6 +77,6 @@ class Recorded:
             read.reading.pairs == 0 or read.agreement >= BADLY,
             f"The poses in {str(self.frames)!r} agree with the depth images on "
             f"{read.agreement:.0%} of the pixels only, and would tear the surface: {hint}"
-            "state how they are written with --convention, or add --poses none to track instead.",
+            "name their convention with --convention, or add --poses none to track the camera.",
         )
         return True

@@ -47,7 +47,8 @@ class Evaluate:
     --method`."""
     seen: tyro.conf.OmitArgPrefixes[Seen] = Seen()
     ceiling: bool = False
-    """Also score the best shape of the weights: the code fitted to the complete truth."""
+    """Also score the best shape that the decoder can reach: its code is fitted to the complete true
+    surface."""
     weights: Path | None = None
     """Weights to use instead of those that come with the package."""
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()

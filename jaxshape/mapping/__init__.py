@@ -1,6 +1,6 @@
 """From an RGB-D recording to the object in it: segmentation, tracking, placement and the map.
 
-The modules, in the order of their imports, which run one way:
+The modules; each imports only from those above it:
 
     config         settings of tracking and mapping
     segmentation   which pixels of a depth frame show the object

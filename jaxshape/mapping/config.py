@@ -19,10 +19,11 @@ class TrackingConfig:
             alone.
         on: Align all pixels, if the camera moves through a still room; or the pixels of the object,
             if the object turns in front of a still camera.
-        min_inliers: Share of the points expected to be seen again that must agree, from 0 to 1.
-        sure_inliers: Share of the same points below which many other guesses are tried, from 0 to
-            1: wrong poses explain up to that much.
-        min_overlap: Share of all points that must be expected to be seen again, from 0 to 1.
+        min_inliers: Least share of agreeing points, among the points expected to be seen again,
+            from 0 to 1.
+        sure_inliers: Share of agreeing points, counted in the same way, below which many other
+            guesses of the pose are tried, from 0 to 1: wrong poses can reach such a share.
+        min_overlap: Least share of all points that are expected to be seen again, from 0 to 1.
         max_angle: Angle from the expected pose beyond which a pose is not believed, in degrees,
             above 0.
         max_distance: Distance from the expected pose beyond which a pose is not believed, in
@@ -69,8 +70,8 @@ class MappingConfig:
             removes depth noise; `points` counts measured points in voxels (paper).
         depth_noise: Standard deviation of the camera's depth, above 0, in metres at 1 m; it grows
             with the square of depth. The default is that of the first Kinect. For `distance`.
-        min_hits: For `points`: depth points that make a voxel occupied, 1 or more (paper: 1). More
-            suppress stray points.
+        min_hits: For `points`: least number of depth points in an occupied voxel, 1 or more (paper:
+            1). A higher number suppresses stray points.
         keyframe_iterations: Steps of the search after each keyframe, from the code found so far, 1
             or more.
 

@@ -162,10 +162,11 @@ def _grids(found: ResultFolder) -> str:
     pictures = illustrations.grids(found)
     figures = "".join(_figure([picture], picture.title, picture.note) for picture in pictures)
     about = (
-        "F holds measured voxels, M the voxels hidden behind them; composed is F, and inside M the "
+        "F holds the measured voxels, M the voxels hidden behind them. The composed grid is F "
+        "outside M, and the refined shape inside M."
     )
     return (
-        f'<section><h2>Grids</h2><p class="soft">{about}refined shape.</p>'
+        f'<section><h2>Grids</h2><p class="soft">{about}</p>'
         f'<div class="pictures">{figures}</div></section>'
         if pictures
         else ""

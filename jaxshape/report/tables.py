@@ -39,10 +39,11 @@ COLUMNS = (
 
 ABOUT_COLUMNS = (
     "Overlap is the share of the keyframe’s points that the map should show from there; inliers "
-    "are the share of these that agree with it, and rmse is the root mean square of their "
-    "distances. Conditioning is the smallest over the largest eigenvalue of the alignment, 0 where "
-    "a motion is free. The last columns are the seconds that each part took. A cell is empty where "
-    "the pose was not tracked, or the part was not due."
+    "are the share of these points that agree with the map, and rmse is the root mean square of "
+    "their distances. Conditioning is the ratio of the smallest to the largest eigenvalue of the "
+    "alignment’s normal equations; 0 means that some motion is unconstrained. The last columns are "
+    "the seconds that each step took. A cell is empty if the pose was not tracked, or if the step "
+    "was not run."
 )
 
 

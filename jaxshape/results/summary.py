@@ -35,9 +35,9 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
     if "objective_refined" in result:
         before, after = (number(result.get(f"objective_{n}"), 4) for n in ("encoder", "refined"))
         meaning = (
-            "how far the shape and the measurement disagree, before and after the search; lower is "
-            "better, and it only compares searches on the same frames: nats per voxel of the whole "
-            f"grid ({_minimised(result)})"
+            "disagreement of the shape with the measurement before and after the search, in nats "
+            f"per voxel of the whole grid ({_minimised(result)}); lower is better. Compare it only "
+            "between searches on the same frames"
         )
         yield Figure("Objective", f"{before} → {after}", meaning)
     if "mesh_measured" in result:
@@ -51,8 +51,8 @@ def headline(found: ResultFolder) -> Iterator[Figure]:
     if "iou_composed" in result:
         before, after = (number(result.get(f"iou_{n}"), 3) for n in ("encoder", "refined"))
         meaning = (
-            f"of the composed shape (encoder {before}, refined {after}): surface voxels in both, "
-            "over those in either; 1 is perfect"
+            f"of the composed shape (encoder {before}, refined {after}): number of surface "
+            "voxels in both shapes, divided by the number in either; 1 is perfect"
         )
         yield Figure("IoU with the truth", number(result["iou_composed"], 3), meaning)
     if "seconds" in result:
@@ -100,7 +100,7 @@ def _judgement(result: dict[str, Any]) -> Iterator[Figure]:
     meaning = (
         "of the measured points of the object lie within 1 cm of the mesh, or within the camera’s "
         f"noise. Area of the mesh: {', '.join(parts) or 'not known what was measured'}; "
-        f"{number(quality.get('free_violated'), **percent)} lie in space that was measured as free"
+        f"{number(quality.get('free_violated'), **percent)} lies in space that was measured as free"
     )
     yield Figure("Explained", number(quality.get("explained"), **percent), meaning)
 

@@ -252,7 +252,7 @@ def _failures(q: Quality) -> Iterator[str]:
     if q.explained < FAILED:
         yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
     if q.free_violated > TORN:
-        yield f"{q.free_violated:.0%} of the mesh lie in space that was measured as free"
+        yield f"{q.free_violated:.0%} of the mesh lies in space that was measured as free"
     if not SIZES[0] <= max(q.size) <= SIZES[1]:
         yield f"the object would be {max(q.size):.2g} m large"
     if q.keyframes and 2 * q.empty_keyframes >= q.keyframes:
@@ -267,9 +267,9 @@ def _doubts(q: Quality) -> Iterator[str]:
     if q.explained < DOUBTFUL:
         yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
     if q.free_violated > SEEN_THROUGH:
-        yield f"{q.free_violated:.0%} of the mesh lie in space that was measured as free"
+        yield f"{q.free_violated:.0%} of the mesh lies in space that was measured as free"
     if q.measured < LITTLE_MEASURED:
-        yield f"only {q.measured:.0%} of the mesh were measured"
+        yield f"only {q.measured:.0%} of the mesh was measured"
     if abs(q.floor_gap) > GAP:
         where = "above" if q.floor_gap > 0 else "below"
         yield f"its lowest point lies {100 * abs(q.floor_gap):.0f} cm {where} the floor"

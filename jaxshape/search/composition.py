@@ -78,11 +78,11 @@ def complete(
 def best_threshold(probability: Float[Array, "*batch x y z"]) -> Float[Array, "*batch"]:
     """The probability above which voxels belong to the shape of greatest expected IoU.
 
-    Of all sets of voxels with the same number of elements, the most probable voxels have the
-    greatest expected intersection with the true surface. So the voxels are sorted, and IoU* is the
-    greatest ratio of expected intersection to expected union. One more voxel raises this ratio if
-    its probability is above IoU* / (1 + IoU*): 1/2 if everything is certain, less otherwise (Lipton
-    et al., "Optimal thresholding of classifiers to maximize F1 measure", 2014, for IoU in place of
+    Among all sets with a given number of voxels, that of the most probable voxels has the greatest
+    expected intersection with the true surface. So the voxels are sorted, and IoU* is the greatest
+    ratio of expected intersection to expected union. One more voxel raises this ratio if its
+    probability is above IoU* / (1 + IoU*): 1/2 if everything is certain, less otherwise (Lipton et
+    al., "Optimal thresholding of classifiers to maximize F1 measure", 2014, for IoU in place of
     F1).
 
     Args:
@@ -103,8 +103,8 @@ def agreed(
 ) -> Float[Array, "*batch x y z"]:
     """Probability of surface from the measurement and a decoder that was conditioned on it.
 
-    With the points of a low-resolution camera, rays pass through thin parts. From binary grids only
-    the measured surface is kept, therefore, and the decoder decides about free space. Soft grids
+    With the points of a low-resolution camera, rays pass through thin parts. Therefore only the
+    measured surface of binary grids is kept, and the decoder decides about free space. Soft grids
     contain the certainty of surface and free space: they are averaged with the decoder at equal
     weight.
 

@@ -18,7 +18,8 @@ def keys_of(
         prior: The shape prior.
 
     Raises:
-        ValueError: There are neither as many keys as codes nor one, or codes have another size.
+        ValueError: The number of keys is neither 1 nor that of the codes, or codes have another
+            size.
     """
     shape = jnp.shape(codes)
     if len(shape) != 2 or shape[-1] != prior.code_size:
@@ -37,7 +38,7 @@ def one_key_each(keys: Key[Array, "*object"], count: int) -> Key[Array, " object
         count: Number of objects.
 
     Raises:
-        ValueError: There are neither as many keys as objects nor one, or they are no keys.
+        ValueError: The number of keys is neither 1 nor that of the objects, or they are not keys.
     """
     if not hasattr(keys, "dtype"):
         raise ValueError(f"keys is {keys!r}; give random keys, as jax.random.key(0).")

@@ -173,7 +173,8 @@ def reconstruct(
     Raises:
         ValueError: An argument is of another type; the grids have no batch axis, differ in shape,
             are not of the prior's resolution, or hold NaN or values outside 0 to 1 (which is
-            checked outside `jax.jit` only); or there are neither as many keys as objects nor one.
+            checked outside `jax.jit` only); or the number of keys is neither 1 nor that of the
+            objects.
     """
     grids = Grids(occupied, occluded, data)
     checks.instance("config", config, RefineConfig, "RefineConfig()")

@@ -152,7 +152,7 @@ def advance(
 
 
 def as_promised(function: str, returned: Any) -> tuple[Any, Trace]:
-    """What a function of a search returned, if it is a state and a trace.
+    """Check that a function of a search returned a state and a trace, and return them.
 
     Args:
         function: Name of the function, `init`, `step` or `resume`.
@@ -172,7 +172,7 @@ def as_promised(function: str, returned: Any) -> tuple[Any, Trace]:
 
 
 def _require_same(stepped: tuple[Any, Trace], before: tuple[Any, Trace]) -> None:
-    """Refuse a step that changes the shape or type of an array, which no compiled loop can."""
+    """Refuse a step that changes the shape or type of an array: compiled loops do not allow it."""
     new, old = dict(_kinds(stepped)), dict(_kinds(before))
     for name in old | new:
         if new.get(name) != old.get(name):

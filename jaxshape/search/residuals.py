@@ -42,14 +42,14 @@ class Residual(NamedTuple):
 
 
 def one_loss(function: str, loss: Any) -> Float[Array, ""]:
-    """What a residual or a penalty returned, if it is one floating-point number.
+    """Check that a residual or a penalty returned one floating-point number, and return it.
 
     Args:
         function: Name of the function.
         loss: What it returned.
 
     Raises:
-        ValueError: It is anything else.
+        ValueError: It returned anything else.
     """
     if loss is None or jnp.shape(loss) or not jnp.issubdtype(jnp.result_type(loss), jnp.floating):
         kind = getattr(loss, "dtype", type(loss).__name__)

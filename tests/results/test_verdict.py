@@ -142,11 +142,11 @@ def test_a_good_result_has_no_reasons():
     [
         ({"explained": 0.7}, "doubtful", "explains only 70%"),
         ({"explained": 0.3}, "failed", "explains only 30%"),
-        ({"measured": 0.05}, "doubtful", "only 5% of the mesh were measured"),
+        ({"measured": 0.05}, "doubtful", "only 5% of the mesh was measured"),
         (
             {"free_violated": 0.2},
             "doubtful",
-            "20% of the mesh lie in space that was measured as free",
+            "20% of the mesh lies in space that was measured as free",
         ),
         ({"free_violated": 0.5}, "failed", "50% of the mesh lie"),
         ({"floor_gap": 0.21}, "doubtful", "21 cm above the floor"),

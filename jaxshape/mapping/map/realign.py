@@ -82,7 +82,7 @@ def realign(
 
     Args:
         clouds: Oriented points that each keyframe shows of each object `[object k ...]`, in its
-            camera's frame, padded to one number.
+            camera's frame, padded to equal numbers.
         T_world_camera: Poses of the keyframes before the realignment `[k]`.
         is_keyframe: False for padding `[k]`.
         lattice: Cells of each object `[object ...]`, in which keyframes are compared.

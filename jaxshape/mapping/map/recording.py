@@ -108,10 +108,11 @@ def follow(
         start: The object in the first frame, from `find_start`.
         mapper: Tracking and mapping, from `build_mapper`.
         prior: The shape prior, which estimates the object's box again as keyframes are added.
-        chosen: Numbers of the frames to use, rising; None for all from the start's on.
+        chosen: Numbers of the frames to use, in increasing order; None for all from that of `start`
+            on.
         use_poses: Whether the given poses are used; then only frames without one are tracked.
-        earlier: Progress of a run that was cut short, after whose last frame this one goes on; None
-            to begin.
+        earlier: Progress of an interrupted run, which this one continues after its last frame; None
+            to begin anew.
 
     Yields:
         The progress after each frame.

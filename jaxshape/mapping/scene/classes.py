@@ -158,9 +158,9 @@ def build_classes(
 
 MARGIN, SPREAD = 0.14, 0.025
 """Least evidence, in nats per hidden surface voxel, for an object to be of a class, and the width
-over which the answer goes from unlikely to likely. Of 40 procedural chairs, 31 have more evidence;
-the others, most of them stools without a back, have at most 0.05. Of 40 tables, 2 have more; of 80
-objects of neither class, only balls and a plant, which `WORST` excludes."""
+over which the answer goes from unlikely to likely. 31 of 40 procedural chairs have more evidence;
+the others, most of them stools without a back, have at most 0.05. 2 of 40 tables have more. Among
+80 objects of neither class, only balls and a plant have more, and `WORST` excludes these."""
 
 OPPOSITE = 0.5
 """Weight of the margin over the opposite front: backs differ from fronts more than sides do."""

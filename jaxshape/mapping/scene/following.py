@@ -104,7 +104,7 @@ def follow_scene(
     Args:
         sequence: The recording, from `open_sequence`.
         classes: The classes that objects may be of, from `build_classes`.
-        chosen: Numbers of the frames to use, rising; None for all from the first on.
+        chosen: Numbers of the frames to use, in increasing order; None for all from the first on.
         first: Number of the first frame, from 0.
         use_poses: Whether the given poses are used; then only frames without one are tracked.
 

@@ -19,14 +19,15 @@ SAMPLE = 4000
 """Number of points in which planes are searched: enough for a plane that holds 2 % of them."""
 
 HYPOTHESES = 256
-"""Planes tried, all at once, each through a few neighbouring points."""
+"""Number of plane hypotheses, all fitted at once, each to a few neighbouring points."""
 
 NEIGHBOURS = 24
 """Number of points that a hypothesis is fitted to: they span half a metre of a wall at three
 metres."""
 
 REFINED = 6
-"""Number of hypotheses with most inliers that are refined: the best one may lie across a corner."""
+"""Number of hypotheses that are refined, those with most inliers: the best one may lie across a
+corner."""
 
 MAX_TILT = 65.0
 """Largest angle, in degrees, between the floor's normal and up in the image of a hand-held
