@@ -39,11 +39,13 @@ def test_derivatives_are_those_of_the_convolution(shape):
 
 
 def test_chunks_change_nothing(monkeypatch):
+    """Up to rounding: sums of large terms of both signs may be small."""
     grid, kernel = draw(5, 4, 3, 2)
     whole = jax.grad(lambda k: jnp.sum(convolve(grid, k) ** 2))(kernel)
     monkeypatch.setattr(stencil, "CACHE_BYTES", 1)
     one_by_one = jax.grad(lambda k: jnp.sum(convolve(grid, k) ** 2))(kernel)
-    np.testing.assert_allclose(whole, one_by_one, rtol=1e-4)
+    rounding = 1e-6 * float(jnp.max(jnp.abs(whole)))
+    np.testing.assert_allclose(whole, one_by_one, rtol=0, atol=rounding)
 
 
 def test_half_precision_is_close_and_keeps_its_type():
