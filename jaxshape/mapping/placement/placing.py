@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 from jax import lax
+from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxshape import checks
@@ -231,16 +232,8 @@ def misfit(
 
 
 def _look_up(values: Float[Array, "x y z"], index: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Values of a lattice, interpolated between its nodes; `EMPTY` outside."""
-    padded = jnp.pad(values, 1, constant_values=EMPTY)
-    place = jnp.clip(index + 1, 0, jnp.array(values.shape) + 1)
-    lower = jnp.clip(jnp.floor(place), 0, jnp.array(values.shape)).astype(jnp.int32)
-    upper = place - lower
-    x, y, z = jnp.stack([1 - upper, upper], axis=-1).swapaxes(0, 1)
-    weights = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
-    corners = lower[:, None] + jnp.indices((2, 2, 2)).reshape(3, 8).T
-    around = padded[tuple(jnp.moveaxis(corners, -1, 0))]
-    return jnp.sum(weights.reshape(-1, 8) * around, axis=-1)
+    """Values of a lattice, interpolated between its nodes."""
+    return map_coordinates(values, list(index.T), order=1, mode="constant", cval=EMPTY)
 
 
 def _corners(logits: Float[Array, "x y z"]) -> Float[Array, "x+1 y+1 z+1"]:
