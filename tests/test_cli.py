@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 import trimesh
+from marks import slow
 from PIL import Image
 from rich.console import Console
 from scene import write_scene
@@ -147,9 +148,7 @@ def move_the_box(folder):
     "damage, said",
     [
         (in_metres, "--depth-scale"),
-        pytest.param(
-            move_the_box, "Nothing was measured inside the object's box", marks=pytest.mark.slow
-        ),
+        slow(move_the_box, "Nothing was measured inside the object's box"),
         (lambda folder: (folder / "box.json").write_text("{"), "cannot be read as JSON"),
         (lambda folder: rewrite_box(folder, size=[1, -1, 1]), "expected positive extents"),
         (lambda folder: (folder / "camera-intrinsics.txt").unlink(), "is missing"),

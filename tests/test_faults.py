@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from marks import slow
 from orbit_recording import (
     FOCAL,
     depth_path,
@@ -74,13 +75,7 @@ def test_a_recording_without_faults(whole, walk):
 
 
 @pytest.mark.parametrize(
-    "missing",
-    [
-        range(2, 14, 3),
-        pytest.param(range(4, 9), marks=pytest.mark.slow),
-        pytest.param(range(3, 10), marks=pytest.mark.slow),
-        range(1, 13),
-    ],
+    "missing", [range(2, 14, 3), slow(range(4, 9)), slow(range(3, 10)), range(1, 13)]
 )
 def test_frames_are_missing(folder, walk, followed, missing):
     """Every third; a jump of 30, 40 and 65 degrees."""

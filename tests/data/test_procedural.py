@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 import trimesh
+from marks import slow
 from procedural_shapes import voxels
 
 from jaxshape.data.chairs import random_chair
@@ -66,7 +67,7 @@ def test_same_seed_same_object_and_style_is_the_only_difference(family):
 
 
 @every_family
-@pytest.mark.parametrize("count", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [1_000, slow(10_000)])
 def test_so_many_seeds_give_as_many_objects_of_all_styles(family, count, without_shape_checks):
     digests, styles = set(), dict.fromkeys(family.styles, 0)
     for seed in range(count):

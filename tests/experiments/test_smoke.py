@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from marks import slow
 from PIL import Image
 
 SCRIPTS = ["iou_by_frames"]
@@ -42,9 +43,7 @@ def check_picture(stem):
     assert "<svg" in stem.with_suffix(".svg").read_text()
 
 
-@pytest.mark.parametrize(
-    "name", [*SCRIPTS, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)]
-)
+@pytest.mark.parametrize("name", [*SCRIPTS, *map(slow, LONG)])
 def test_smoke(name, linear_weights, tmp_path, request):
     if name == "step_size":  # traces its settings
         request.getfixturevalue("unchecked_types")

@@ -1,7 +1,6 @@
 """A batch spread over devices, or over processes, trains as on one device."""
 
 import json
-import os
 import re
 import socket
 import subprocess
@@ -12,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_training
+from forced_devices import environment
 from safetensors.numpy import load_file
 
 from jaxshape.model import training
 from jaxshape.process import join_processes
-
-FLAGS = os.environ.get("XLA_FLAGS", "")
 
 
 @pytest.fixture(scope="module")
@@ -26,13 +24,9 @@ def begin(start):
 
     def begin(folder, *machines, devices=1):
         command = [sys.executable, tiny_training.__file__, folder, start, *machines]
-        settings = {
-            "XLA_FLAGS": f"{FLAGS} --xla_force_host_platform_device_count={devices}",
-            "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        }
         return subprocess.Popen(
             [str(part) for part in command],
-            env=os.environ | settings,
+            env=environment(devices),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 
 from jaxshape.geometry.grids import Grids, binary
 from jaxshape.model.shapes import (
@@ -75,10 +76,7 @@ def test_each_code_is_decoded_with_its_own_objects_features():
     np.testing.assert_allclose(logits, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "method",
-    ["gradient:adam", *(pytest.param(name, marks=pytest.mark.slow) for name in ("cma", "hybrid"))],
-)
+@pytest.mark.parametrize("method", ["gradient:adam", slow("cma"), slow("hybrid")])
 def test_a_conditioned_decoder_is_searched_with_each_objects_features(method):
     """In company as alone; and what a search found is what its own object decodes to."""
     config = RefineConfig(iterations=5, population=4, space="raw")

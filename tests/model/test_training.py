@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 import tiny_training
+from marks import slow
 from tiny_training import CONFIG, NUMBERS, OBJECTS, PATHS
 
 from jaxshape.data.config import DATASETS, FAULTLESS, InputConfig
@@ -372,10 +373,7 @@ def test_the_prior_of_a_completion_network_is_normal(dataset, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, prior.params, state.average)
 
 
-@pytest.mark.parametrize(
-    "architecture",
-    [pytest.param(CONFIG.architecture, marks=pytest.mark.slow), Completion((4, 4, 4), 1, 3)],
-)
+@pytest.mark.parametrize("architecture", [slow(CONFIG.architecture), Completion((4, 4, 4), 1, 3)])
 def test_reports_score_the_objects_kept_out(monkeypatch, dataset, tmp_path, architecture):
     monkeypatch.setattr(training, "validation_size", lambda *_: 2)
     config = replace(CONFIG, architecture=architecture, steps=1, average=0.5)

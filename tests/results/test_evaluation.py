@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from marks import slow
 
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
@@ -137,13 +138,7 @@ def test_points_are_those_that_all_frames_together_measure(models):
     np.testing.assert_array_equal(case.grids.occluded[0], fusion.occluded(merged))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "kinect",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("realsense", "iphone-lidar")),
-    ],
-)
+@pytest.mark.parametrize("name", ["kinect", slow("realsense"), slow("iphone-lidar")])
 def test_noisy_frames_are_fused_as_distances(models, name):
     """F and M are soft, as many frames know more than one, and they agree with the truth."""
     case = observe(models[0], replace(CONFIG, camera=name, frames=(1, 4)))

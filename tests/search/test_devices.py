@@ -1,16 +1,14 @@
 """Objects are spread over all devices by themselves, and find what one device finds."""
 
 import json
-import os
 import subprocess
 import sys
 
 import four_devices
 import numpy as np
 import pytest
+from forced_devices import environment
 from four_devices import METHODS, OBJECTS
-
-FLAGS = os.environ.get("XLA_FLAGS", "")
 
 
 @pytest.fixture(scope="module")
@@ -18,14 +16,10 @@ def found():
     """What searches find on one device, and on four."""
 
     def begin(devices):
-        settings = {
-            "XLA_FLAGS": f"{FLAGS} --xla_force_host_platform_device_count={devices}",
-            "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        }
         command = [sys.executable, four_devices.__file__]
         pipe = subprocess.PIPE
         return subprocess.Popen(
-            command, env=os.environ | settings, stdout=pipe, stderr=pipe, text=True
+            command, env=environment(devices), stdout=pipe, stderr=pipe, text=True
         )
 
     def outcome(process):

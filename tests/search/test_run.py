@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 
 from jaxshape.geometry.grids import Grids
 from jaxshape.search.config import RefineConfig
@@ -30,8 +31,8 @@ METHODS = [
     "gradient",
     "evosax:SNES",
     "gauss-newton",
-    pytest.param("gradient:lbfgs", marks=pytest.mark.slow),
-    pytest.param("hybrid:adam", marks=pytest.mark.slow),
+    slow("gradient:lbfgs"),
+    slow("hybrid:adam"),
 ]
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 from problems import SHAPE, D
 
 from jaxshape.checks import positive
@@ -26,13 +27,7 @@ GRIDS = {
 }
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        "gradient:adam",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("cma", "gauss-newton")),
-    ],
-)
+@pytest.mark.parametrize("method", ["gradient:adam", slow("cma"), slow("gauss-newton")])
 def test_a_grid_of_settings_over_objects_is_one_program(method, counter, counted):
     """It finds what one setting at a time finds, and other settings are no other program."""
     names, values = zip(*GRIDS[method].items(), strict=True)

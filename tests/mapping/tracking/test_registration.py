@@ -4,6 +4,7 @@ import jaxlie
 import numpy as np
 import pytest
 from analytic_room import CHAIR, CRATE, FLOOR, TABLE, WALLS, K, room
+from marks import slow
 from scipy.spatial.transform import Rotation
 
 from jaxshape.geometry.camera import intrinsics_of
@@ -55,7 +56,7 @@ def relative(second):
 # ------------------------------------------------------------------ registration
 
 
-@pytest.mark.parametrize("azimuth", [pytest.param(0.5, marks=pytest.mark.slow), -10, 10, 20])
+@pytest.mark.parametrize("azimuth", [slow(0.5), -10, 10, 20])
 def test_steps_of_up_to_twenty_degrees_are_found(azimuth):
     second = seen_from(azimuth, seed=1)
     found = register(prepare(second.depth, LENS), ALL, REFERENCE, STILL)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 from problems import run_batch, sphere
 
 from jaxshape.search.config import RefineConfig
@@ -14,16 +15,16 @@ ITERATIONS = 12
 CONFIG = RefineConfig(iterations=ITERATIONS, population=6, sigma0=0.5, tolerance=1e-9)
 METHODS = [
     "cma",
-    pytest.param("cma:ipop", marks=pytest.mark.slow),
-    pytest.param("cma:bipop", marks=pytest.mark.slow),
+    slow("cma:ipop"),
+    slow("cma:bipop"),
     "gradient:adam",
     "gradient:lbfgs",
     "gradient:noisy_sgd",
     "gradient:prodigy",
     "evosax:CMA_ES",
-    pytest.param("evosax:EvoTF_ES", marks=pytest.mark.slow),
+    slow("evosax:EvoTF_ES"),
     "evosax:Open_ES",
-    pytest.param("hybrid", marks=pytest.mark.slow),
+    slow("hybrid"),
     "gauss-newton",
 ]
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import slow
 from problems import run_batch, sphere
 
 from jaxshape.search.config import RefineConfig
@@ -31,8 +32,8 @@ def search(name, config=CONFIG):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("cma:ipop", marks=pytest.mark.slow),
-        pytest.param("cma:bipop", marks=pytest.mark.slow),
+        slow("cma:ipop"),
+        slow("cma:bipop"),
         "gradient:adam",
         "evosax:Sep_CMA_ES",
         "evosax:xNES",
