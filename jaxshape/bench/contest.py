@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -93,7 +92,7 @@ class _Field(NamedTuple):
     """The decoder and coordinates in which a method is run.
 
     Attributes:
-        decoder: The shape prior, which takes points of the search space instead of codes.
+        decoder: The shape prior.
         space: Coordinates of the search.
         observer: Counts the evaluations.
     """
@@ -104,7 +103,8 @@ class _Field(NamedTuple):
 
     def objectives(self, decoder: ShapePrior, targets: Target) -> Callable[..., Any]:
         """The watched objective of each problem, by its number, as a function of points."""
-        return watched(objectives(decoder, targets), self.observer, self.space.to_code)
+        of_number = objectives(decoder, targets, self.space)
+        return watched(of_number, self.observer, self.space.to_code)
 
     def start(self, problems: Sequence[Problem], seed: int) -> "_Start":
         """Stack the arrays of problems."""
@@ -120,13 +120,7 @@ class _Field(NamedTuple):
 
 def _field(example: Problem, config: RefineConfig, budget: int) -> _Field:
     """The decoder of a problem, in the coordinates that the settings select."""
-    space, decoder = search_space(example.prior, config), example.decoder
-
-    def decode(prepared, points):
-        return decoder.model.decode(prepared, jax.vmap(space.to_code)(points))
-
-    in_points = decoder._replace(model=replace(decoder.model, decode=decode))
-    return _Field(in_points, space, Observer(budget))
+    return _Field(example.decoder, search_space(example.prior, config), Observer(budget))
 
 
 class _Start(NamedTuple):

@@ -31,8 +31,13 @@ def describe_machine(packages: Iterable[str]) -> dict[str, Any]:
 
 
 def load() -> float | None:
-    """Load of the last minute: runnable processes for each core; None if not known."""
-    return round(os.getloadavg()[0] / _cores(), 2) if hasattr(os, "getloadavg") else None
+    """Load of the last minute: runnable processes for each core; None if not known.
+
+    The load is that of the whole machine, hence so is the number of cores.
+    """
+    if not hasattr(os, "getloadavg"):
+        return None
+    return round(os.getloadavg()[0] / (os.cpu_count() or 1), 2)
 
 
 def _cores() -> int:

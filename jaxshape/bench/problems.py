@@ -19,8 +19,10 @@ from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import ShapePrior, decode, encode, pick, share_all
 from jaxshape.model.weights import fingerprint, load_prior
-from jaxshape.search.objective import objective
+from jaxshape.search.curvature import Composed
+from jaxshape.search.objective import ObjectTerms, objective_of
 from jaxshape.search.residuals import BALANCED, SOFT, Residual, Target, cross_entropy
+from jaxshape.search.space import LatentSpace
 
 WEIGHTS = "chair-autoencoder"
 """The packaged weights whose codes are searched."""
@@ -70,7 +72,7 @@ class Problem(NamedTuple):
         Args:
             code: A code `[d]`.
         """
-        return objective(self.decoder, self.target, residual=EQUATION_7)(code)
+        return _objective(self.decoder, self.target)(code)
 
     def iou(self, code: Float[Array, " d"]) -> Float[Array, ""]:
         """Overlap of the decoded shape with the true surface, 0 to 1.
@@ -93,15 +95,27 @@ def stacked_targets(problems: Sequence[Problem]) -> Target:
 
 
 def objectives(
-    decoder: ShapePrior, targets: Target
-) -> Callable[[Int[Array, ""]], Callable[[Float[Array, " d"]], Float[Array, ""]]]:
+    decoder: ShapePrior, targets: Target, space: LatentSpace | None = None
+) -> Callable[[Int[Array, ""]], Composed]:
     """The objectives of problems, by index.
 
     Args:
         decoder: The shape prior, its parameters prepared.
         targets: Targets of the problems `[problem ...]`.
+        space: Coordinates of the points that the objectives take; None for codes.
     """
-    return lambda number: objective(decoder, pick(targets, number), residual=EQUATION_7)
+    return lambda number: _objective(decoder, pick(targets, number), space)
+
+
+def _objective(decoder: ShapePrior, target: Target, space: LatentSpace | None = None) -> Composed:
+    """The objective of one problem, also inside of branches and loops under `jax.vmap`.
+
+    JAX copies what a branch closes over to each element of a batch, which `search.objective` would
+    take for several networks. All problems have the same one.
+    """
+    prepared = decoder.model.prepare(decoder.params, None, "float32")
+    own = ObjectTerms(pick(prepared.own, 0), target, jnp.float32(0))
+    return objective_of(decoder, prepared, own, EQUATION_7, space=space)
 
 
 def problems(

@@ -197,7 +197,8 @@ def conditions(found: Sequence[Standing]) -> list[str]:
     rows = [row for one in found for row in one.entry.rows.values()]
     loads = [row["load"] for row in rows if row.get("load") is not None]
     said = [
-        f"{m['processor']}, {m['cores']} cores, device {m['device']}, Python {m['python']}, "
+        f"{m['processor']}, {m['cores']} core{'s' * (m['cores'] > 1)}, device {m['device']}, "
+        f"Python {m['python']}, "
         + ", ".join(f"{name} {version}" for name, version in m["packages"].items() if version)
         + "."
         for m in machines.values()

@@ -173,6 +173,27 @@ def objective(
     batch = None if grids is None else jax.tree.map(lambda x: jnp.asarray(x)[None], grids)
     prepared = prepare_one(prior, batch, precision)
     own = ObjectTerms(pick(prepared.own, 0), target, jnp.asarray(penalty_weight, jnp.float32))
+    return objective_of(prior, prepared, own, residual, penalty, space)
+
+
+def objective_of(
+    prior: ShapePrior,
+    prepared: Prepared,
+    own: ObjectTerms,
+    residual: Residual,
+    penalty: Penalty | None = None,
+    space: LatentSpace | None = None,
+) -> Composed:
+    """`objective` of a prepared network, which all elements of a batch are known to share.
+
+    Args:
+        prior: The shape prior.
+        prepared: Its prepared parameters; only the shared ones are used.
+        own: Part of the objective that belongs to this object.
+        residual: The residual that the target belongs to.
+        penalty: `code [d] -> ` nats per voxel to add to the residual; None for no penalty.
+        space: Coordinates of the points that the objective takes; None for codes.
+    """
 
     def about(point):
         chosen = raw(prior)._replace(mean=jnp.zeros_like(point)) if space is None else space

@@ -44,6 +44,24 @@ def test_adam_walks_as_it_does_in_refine(two, linear_prior):
         assert rows[one.name]["calls"] == 66 and rows[one.name]["stop"] == "budget"
 
 
+def test_a_line_search_has_its_problem_to_itself(two):
+    rows, alone = searched("gradient:lbfgs", two[:1])
+    (row,) = rows.values()
+    assert alone and row["objective"][-1] < row["objective"][0]
+
+
+def test_an_objective_may_be_evaluated_in_a_branch_of_a_batch(two):
+    """As in the line search of a loop of one's own."""
+
+    def lowered(code):
+        loss = two[0].objective
+        return jax.lax.cond(code[0] > 0, loss, lambda code: loss(code) + 1, code)
+
+    codes = jnp.stack([two[0].first_code.at[0].set(sign) for sign in (1.0, -1.0)])
+    expected = [two[0].objective(codes[0]), two[0].objective(codes[1]) + 1]
+    np.testing.assert_allclose(jax.jit(jax.vmap(lowered))(codes), expected, rtol=1e-6)
+
+
 def test_a_population_does_not_depend_on_its_company(two):
     together, _ = searched("evosax:SNES", two)
     alone, _ = searched("evosax:SNES", two[1:])
