@@ -43,15 +43,14 @@ cad_chairs: $(VENV)/.runtime
 	$(BIN)/python experiments/cad_seats.py --packages packages --output cad_chairs
 
 # One process for each core. Most of their time goes into compiling, so they share compiled programs,
-# which also serve the next run, and use a generator of code that takes half the time, where JAX
-# still has it.
-GENERATOR := import jax; \
-	print("--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else "")
+# which also serve the next run, and compile quickly, as commands do.
+FLAGS := import os; from jaxshape.process import compile_quickly; \
+	compile_quickly(); print(os.environ.get("XLA_FLAGS", ""))
 
 test: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/out/compiled
 test: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
 test: $(VENV)/.develop
-	XLA_FLAGS="$${XLA_FLAGS-$$($(BIN)/python -c '$(GENERATOR)')}" OPENBLAS_NUM_THREADS=1 \
+	XLA_FLAGS="$$($(BIN)/python -c '$(FLAGS)')" OPENBLAS_NUM_THREADS=1 \
 		$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(VENV)/.develop

@@ -9,6 +9,7 @@ import threading
 import warnings
 from contextlib import suppress
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -20,12 +21,13 @@ _M_ARENA_MAX = -8  # of mallopt, from malloc.h
 def prepare_process() -> None:
     """Prepare the process of a command; to be called before JAX is imported.
 
-    Compiled programs are kept (`keep_compiled`), all threads share their memory (`share_memory`),
-    and LAPACK gets one thread: the covariances of a search are too small to split, and waiting
-    threads make a busy machine many times slower.
+    Compiled programs are kept (`keep_compiled`) and quickly made (`compile_quickly`), all threads
+    share their memory (`share_memory`), and LAPACK gets one thread: the covariances of a search are
+    too small to split, and waiting threads make a busy machine many times slower.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     share_memory()
+    compile_quickly()
     keep_compiled()
     end_in_order()
 
@@ -76,6 +78,16 @@ def keep_compiled() -> None:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     # JAX's default is one second, but a command also compiles dozens of small programs.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def compile_quickly() -> None:
+    """Let XLA use its older generator of code on CPUs, where JAX still has it (JAX 0.10).
+
+    The programs are as fast; compiling those of a reconstruction takes a fifth less processor time
+    and 40 % less memory. `XLA_FLAGS` takes precedence.
+    """
+    if metadata.version("jax").startswith("0.10."):  # later versions refuse the flag
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 
 def bound_folder(folder: Path, most: int) -> None:

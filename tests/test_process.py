@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from jaxshape import process
-from jaxshape.process import bound_folder, keep_compiled, processor
+from jaxshape.process import bound_folder, compile_quickly, keep_compiled, processor
 
 FOLDER, SMALLEST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
@@ -46,6 +46,26 @@ def test_the_second_process_finds_what_the_first_compiled(environment, tmp_path)
     assert hits() == 0
     assert hits() > 0
     assert (tmp_path / "jaxshape/compiled").stat().st_mode & 0o077 == 0
+
+
+def test_this_jax_knows_the_flags_with_which_it_compiles_quickly(environment):
+    """An unknown flag would end the process."""
+    environment.pop("XLA_FLAGS", None)
+    program = """
+from jaxshape.process import compile_quickly
+compile_quickly()
+import jax
+print(jax.jit(lambda x: x + 1)(1.0))
+"""
+    command = [sys.executable, "-c", program]
+    answer = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert answer.stdout == "2.0\n"
+
+
+def test_flags_of_the_user_are_kept(environment):
+    environment["XLA_FLAGS"] = "--xla_force_host_platform_device_count=4"
+    compile_quickly()
+    assert environment["XLA_FLAGS"] == "--xla_force_host_platform_device_count=4"
 
 
 def test_the_folder_of_compiled_programs_is_bounded(tmp_path):

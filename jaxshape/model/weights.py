@@ -161,16 +161,17 @@ def load_prior(
     found = _model(metadata.get("kind", AUTOENCODER.kind), model, where)
     mean, covariance = tensors.pop("code_mean", None), tensors.pop("code_covariance", None)
     calibration = _calibration(tensors.pop("calibration", None), where)
-    # Converted by NumPy: JAX would compile a program for each shape.
+    # NumPy converts, and device_put moves: jax.numpy would compile a program for each shape.
     with np.errstate(over="ignore"):  # values that overflow are found to be infinite below
-        named = {name: jnp.asarray(x) for name, x in _weights(tensors, where).items()}
+        named = jax.device_put(_weights(tensors, where))
         mean, covariance = (None if x is None else x.astype(np.float32) for x in (mean, covariance))
     try:
         params = unflatten(named)
     except (TypeError, ValueError) as problem:
         raise WeightsError(f"{str(where)!r} holds no weights: {problem}.") from None
     _check(found, params, mean, covariance, where)
-    return ShapePrior(found, params, jnp.asarray(mean), jnp.asarray(covariance), calibration)
+    mean, covariance = jax.device_put((mean, covariance))
+    return ShapePrior(found, params, mean, covariance, calibration)
 
 
 def _calibration(numbers: np.ndarray | None, path: Path) -> Calibration | None:
