@@ -33,8 +33,8 @@ class Rebuild:
             metavar="METHOD",
             help="The search that starts from the first code: encoder (no search), "
             f"{', '.join(families())}, a variant ({VARIANTS}), or your own function by its import "
-            "path, package.module:function. None stands for cma, or for encoder with a network "
-            "that is conditioned on the measurement.",
+            "path, package.module:function. None stands for gradient:adam, or for encoder with a "
+            "network that is conditioned on the measurement.",
         ),
     ] = None
     search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig(samples=16)

@@ -23,6 +23,7 @@ from jaxshape.search.reconstruction import (
     refiner_for,
     require_measured,
     search_space,
+    usual_method,
 )
 from jaxshape.search.refiner import StopReason
 from jaxshape.search.residuals import BALANCED, PAPER, RESIDUALS, Residual, cross_entropy
@@ -49,6 +50,14 @@ def searched(linear_prior):
 
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
+
+
+def test_only_decoders_that_do_not_see_the_measurement_are_searched(linear_prior):
+    assert usual_method(linear_prior) == "gradient:adam"
+    model = replace(linear_prior.model, conditional=True)
+    assert usual_method(linear_prior._replace(model=model)) == "encoder"
+
+
 grids = arrays(bool, (3, 4, 2))
 
 
