@@ -1,6 +1,6 @@
 r"""Do the priors' predictions of hidden parts tell chairs, tables and other objects apart?
 
-    python experiments/class_evidence.py --tables table.safetensors
+    python experiments/class_evidence.py
 
 Objects that no network was trained on, seen in six frames along an arc of 90 to 200 degrees with a
 Kinect's noise, 320 x 240 pixels; objects of neither class are boxes, plants, lamps, bins and balls.
@@ -28,8 +28,8 @@ from jaxshape.data.virtual_cameras import VirtualCamera
 from jaxshape.geometry import camera
 from jaxshape.geometry.fusing import fusion_named
 from jaxshape.geometry.grids import Grids
-from jaxshape.mapping.scene.classes import decided
-from jaxshape.mapping.scene.evidence import Predicted, predict_hidden
+from jaxshape.mapping.scene.classes import decided, stances_of
+from jaxshape.mapping.scene.evidence import predict_hidden
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.model.weights import load_prior
 from jaxshape.process import prepare_process
@@ -46,8 +46,8 @@ class Config(runs.Config):
 
     count: int = 40
     """Number of objects of each family; of objects of neither class there are twice as many."""
-    tables: Path | None = None
-    """Weights for tables; None uses the class of chairs alone."""
+    tables: Path = Path(__file__).parent / "weights" / "table.safetensors"
+    """Weights for tables."""
 
 
 def main(config: Config) -> None:
@@ -57,11 +57,8 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Score all objects, going on from earlier results of the same settings."""
-    tables = config.tables
-    journal = config.journal("class_evidence", count=config.count, tables=tables is not None)
-    priors = {"chair": load_prior("chair")}
-    if tables is not None:
-        priors["table"] = load_prior(tables)
+    journal = config.journal("class_evidence", count=config.count)
+    priors = {"chair": load_prior("chair"), "table": load_prior(config.tables)}
     tasks = {f"{kind}-{seed}": partial(scored, priors, kind, seed)
              for kind, seed in objects(config.count)}  # fmt: skip
     runs.complete(journal, tasks, confusion, lambda one: str(one["class"]))
@@ -98,17 +95,18 @@ def seen(kind: str, seed: int) -> Grids:
 def scored(priors: dict[str, ShapePrior], kind: str, seed: int) -> dict[str, Any]:
     """The scores of the priors' predictions for an object, and the decision."""
     grids = seen(kind, seed)
-    found = {name: predict_hidden(prior, grids) for name, prior in priors.items()}
-    one = {name: Predicted(*(np.asarray(x)[0] for x in of)) for name, of in found.items()}
-    decision = decided(one)
+    found = {
+        name: np.asarray(predict_hidden(prior, grids, stances_of(name)))[0]
+        for name, prior in priors.items()
+    }
+    decision = decided(found)
     return {
         "kind": kind,
         "class": decision.name,
         "quarters": decision.quarters,
         "sure": round(decision.sure, 3),
         "scores": decision.scores,
-        "surface": {name: of.surface.round(3).tolist() for name, of in one.items()},
-        "overlap": {name: of.overlap.round(3).tolist() for name, of in one.items()},
+        "surface": {name: of.round(3).tolist() for name, of in found.items()},
     }
 
 

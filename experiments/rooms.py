@@ -1,6 +1,6 @@
 r"""Rooms with several objects, filmed by hand: are they found, classified correctly and rebuilt?
 
-    python experiments/rooms.py --tables table.safetensors
+    python experiments/rooms.py
 
 Each room has a floor, a wall, and 3 to 6 objects: procedural chairs and tables that no network was
 trained on, and objects of neither class. The images have a Kinect's noise and 320 x 240 pixels; the
@@ -54,8 +54,8 @@ class Config(runs.Config):
 
     rooms: int = 24
     frames: int = 16
-    tables: Path | None = None
-    """Weights for tables; None uses the class of chairs alone."""
+    tables: Path = Path(__file__).parent / "weights" / "table.safetensors"
+    """Weights for tables."""
 
 
 class Placed(NamedTuple):
@@ -77,11 +77,8 @@ def main(config: Config) -> None:
 
 def run(config: Config) -> Journal:
     """Rebuild every room, going on from earlier results of the same settings."""
-    tables = config.tables
-    journal = config.journal("rooms", frames=config.frames, tables=tables is not None)
-    priors = {"chair": load_prior("chair")}
-    if tables is not None:
-        priors["table"] = load_prior(tables)
+    journal = config.journal("rooms", frames=config.frames)
+    priors = {"chair": load_prior("chair"), "table": load_prior(config.tables)}
     classes = build_classes(priors, placers={"chair": load_prior("chair-autoencoder")})
     tasks = {str(i): partial(one_room, i, config.frames, classes) for i in range(config.rooms)}
     runs.complete(journal, tasks, summary, json.dumps)

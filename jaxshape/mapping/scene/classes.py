@@ -1,10 +1,12 @@
 """The classes that objects of a scene may be of, and how one is decided. [host]
 
 Each class has a prior. An object belongs to the class whose prior predicts hidden parts of it
-clearly better than its rivals do. The rivals are the priors of other classes and, where objects of
-the class have a front, the same prior with the front turned away. The prior of chairs predicts a
-plant equally badly from all sides, a cube equally well from all sides, and a chair well only with
-the right front.
+clearly better as the object stands than in a wrong stance: with its front turned away or, where
+objects of the class have no front, upside down. The prior of chairs predicts a plant equally badly
+from all sides, a cube equally well from all sides, and a chair well only with the right front. The
+prior of tables predicts a cube equally well either way up, and a table well only on its legs.
+Likelihoods of different priors are not compared: a network that is better trained, or more
+confident, would win every object.
 """
 
 from collections.abc import Mapping
@@ -19,7 +21,7 @@ from jaxshape.mapping.config import MappingConfig, TrackingConfig
 from jaxshape.mapping.map.mapper import Mapper, build_mapper
 from jaxshape.mapping.map.state import power_of_two
 from jaxshape.mapping.placement.placing import PlacementConfig
-from jaxshape.mapping.scene.evidence import TURNS, Predicted, predict_hidden
+from jaxshape.mapping.scene.evidence import TOPPLED, TURNS, UPRIGHT, Stance, predict_hidden
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.config import RefineConfig
 from jaxshape.search.reconstruction import Reconstruction, refiner_for, usual_method
@@ -74,8 +76,8 @@ class Decision(NamedTuple):
         name: Name of its class; None for none of them.
         quarters: Quarters of a turn by which its front is turned from that of its box.
         sure: Probability of the answer, from 0 to 1.
-        scores: Evidence for each class, in nats per hidden surface voxel: the margin of its
-            likelihood over that of its best rival.
+        scores: Evidence for each class, in nats per hidden surface voxel: the margin of the
+            likelihood under its prior over that in a wrong stance.
     """
 
     name: str | None
@@ -156,18 +158,31 @@ def build_classes(
 
 # Decisions -------------------------------------------------------------------------------------
 
-MARGIN, SPREAD = 0.14, 0.025
-"""Least evidence, in nats per hidden surface voxel, for an object to be of a class, and the width
-over which the answer goes from unlikely to likely. 31 of 40 procedural chairs have more evidence;
-the others, most of them stools without a back, have at most 0.05. 2 of 40 tables have more. Among
-80 objects of neither class, only balls and a plant have more, and `WORST` excludes these."""
+
+class Standard(NamedTuple):
+    """The evidence that an object needs to be of a class.
+
+    Attributes:
+        least: Least margin, in nats per hidden surface voxel.
+        spread: Width over which the answer goes from unlikely to likely.
+    """
+
+    least: float
+    spread: float
+
+
+WITH_FRONT, WITHOUT_FRONT = Standard(0.14, 0.025), Standard(0.065, 0.01)
+"""Evidence over other fronts, and over the object upside down. It was chosen on procedural chairs
+and tables, boxes, plants, lamps, bins and balls. The median of chairs over other fronts is 0.31,
+that of tables over tables upside down 0.18. Of 48 objects of neither class, none reaches the first,
+and only a box and a few plants the second; most of these plants are too unlikely (`WORST`)."""
 
 OPPOSITE = 0.5
 """Weight of the margin over the opposite front: backs differ from fronts more than sides do."""
 
-WORST = -1.4
-"""Least log-likelihood of hidden surface voxels for an object to be of any class. It is -1.57 or
-less for balls, and -1.58 or less for plants."""
+WORST = -1.25
+"""Least log-likelihood of hidden surface voxels for an object to be of any class. It is less for
+balls and for most plants."""
 
 
 UNUSUAL = 14.0
@@ -191,37 +206,51 @@ def decide(
     count = len(grids.occupied)
     rows = jnp.minimum(jnp.arange(power_of_two(count)), count - 1)
     padded = Grids(grids.occupied[rows], grids.occluded[rows])
-    found = {name: predict_hidden(prior, padded) for name, prior in priors.items()}
+    found = {
+        name: np.asarray(predict_hidden(prior, padded, stances_of(name)))
+        for name, prior in priors.items()
+    }
     return [
-        decided(
-            {name: Predicted(*(np.asarray(x)[i] for x in of)) for name, of in found.items()},
-            None if sizes is None else sizes[i],
-        )
+        decided({name: of[i] for name, of in found.items()}, None if sizes is None else sizes[i])
         for i in range(count)
     ]
 
 
+def stances_of(name: str) -> tuple[Stance, ...]:
+    """The stances that are compared for a class, the upright ones first.
+
+    Args:
+        name: Name of the class.
+    """
+    return UPRIGHT + TOPPLED if name in FRONTLESS else UPRIGHT
+
+
 def decided(
-    found: Mapping[str, Predicted], size: Float[np.ndarray, " 3"] | None = None
+    found: Mapping[str, Float[np.ndarray, " stance"]], size: Float[np.ndarray, " 3"] | None = None
 ) -> Decision:
     """The class and the front of one object, from what each prior predicts.
 
+    Where it may be of several classes, those with a front take precedence: chairs stand on legs as
+    tables do, but no side of a table looks like the front of a chair.
+
     Args:
-        found: Scores `[turn]` of each class.
+        found: Log-likelihood of hidden surface voxels for each class in its stances (`stances_of`).
         size: Extents of the object's box, in metres; None where it may have any size.
     """
-    total = {name: np.asarray(one.surface) for name, one in found.items()}
-    fronts = {name: int(own.argmax()) for name, own in total.items()}
-    margins = {name: _margin(name, total) for name in total}
-    best = max(margins, key=lambda name: margins[name])
-    likely = _sigmoid((margins[best] - MARGIN) / SPREAD)
-    is_odd = size is not None and deviation(best, size, fronts[best]) > UNUSUAL
-    if total[best].max() < WORST or is_odd:
-        likely = min(likely, 0.1)
+    margins = {name: _margin(name, own) for name, own in found.items()}
+    fronts = {name: int(own[:TURNS].argmax()) for name, own in found.items()}
+    likely = {}
+    for name, own in found.items():
+        standard = WITHOUT_FRONT if name in FRONTLESS else WITH_FRONT
+        is_odd = size is not None and deviation(name, size, fronts[name]) > UNUSUAL
+        most = 0.1 if own[:TURNS].max() < WORST or is_odd else 1.0
+        likely[name] = min(_sigmoid((margins[name] - standard.least) / standard.spread), most)
     scores = {name: round(margin, 3) for name, margin in margins.items()}
-    if likely > 0.5:
-        return Decision(best, fronts[best], likely, scores)
-    return Decision(None, 0, 1 - likely, scores)
+    possible = [name for name in found if likely[name] > 0.5]
+    if not possible:
+        return Decision(None, 0, 1 - max(likely.values()), scores)
+    best = max(possible, key=lambda name: (name not in FRONTLESS, margins[name]))
+    return Decision(best, fronts[best], likely[best], scores)
 
 
 def deviation(name: str, size: Float[np.ndarray, " 3"], quarters: int) -> float:
@@ -238,15 +267,13 @@ def deviation(name: str, size: Float[np.ndarray, " 3"], quarters: int) -> float:
     return float(np.sum((np.log(own / typical) / spread) ** 2))
 
 
-def _margin(name: str, total: Mapping[str, Float[np.ndarray, " turn"]]) -> float:
-    """Evidence for a class: its least margin over other classes and over its own other fronts."""
-    own = total[name]
+def _margin(name: str, own: Float[np.ndarray, " stance"]) -> float:
+    """Evidence for a class: the margin of its likelihood over that in wrong stances."""
+    if name in FRONTLESS:
+        return float(own[:TURNS].max() - own[TURNS:].max())
     k = int(own.argmax())
-    margins = [own[k] - other.max() for rival, other in total.items() if rival != name]
-    if name not in FRONTLESS:
-        beside = max(own[(k + 1) % TURNS], own[(k - 1) % TURNS])
-        margins += [own[k] - beside, OPPOSITE * (own[k] - own[(k + 2) % TURNS])]
-    return float(min(margins, default=0.0))
+    beside = max(own[(k + 1) % TURNS], own[(k - 1) % TURNS])
+    return float(min(own[k] - beside, OPPOSITE * (own[k] - own[(k + 2) % TURNS])))
 
 
 def _sigmoid(x: float) -> float:

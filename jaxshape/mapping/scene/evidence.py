@@ -7,6 +7,7 @@ chairs predicts the lower half of a chair from its upper half, but not the lower
 Where no prior predicts well enough, the object is of none of the classes.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,25 +21,27 @@ from jaxshape.model.shapes import ShapePrior, decode, encode
 TURNS = 4
 """Fronts that are compared: the box of an object, turned by quarters about the vertical."""
 
-BLOCK = 8
-"""Voxels along each side of the blocks that are hidden."""
 
-
-class Predicted(NamedTuple):
-    """How well hidden parts were predicted; means over hidden voxels, then over hidden parts.
+class Stance(NamedTuple):
+    """How an object stands in the box that a prior is given.
 
     Attributes:
-        surface: Log-likelihood of hidden surface voxels `[*batch]`, in nats per voxel.
-        free: Log-likelihood of hidden free voxels `[*batch]`, in nats per voxel.
-        overlap: Intersection over union of predicted and hidden surface `[*batch]`, from 0 to 1.
-        surprise: Log-likelihood minus its value expected by the prior itself `[*batch]`, in nats
-            per voxel; near 0 for an object like those of the prior, negative for others.
+        quarters: Quarters of a turn of its front, from +z to +x.
+        is_upside_down: Whether it is mirrored from top to bottom.
     """
 
-    surface: Float[Array, "*batch"]
-    free: Float[Array, "*batch"]
-    overlap: Float[Array, "*batch"]
-    surprise: Float[Array, "*batch"]
+    quarters: int
+    is_upside_down: bool = False
+
+
+UPRIGHT = tuple(Stance(quarters) for quarters in range(TURNS))
+"""An object with its front at each side."""
+
+TOPPLED = tuple(Stance(quarters, is_upside_down=True) for quarters in range(TURNS))
+"""The same, upside down."""
+
+BLOCK = 8
+"""Voxels along each side of the blocks that are hidden."""
 
 
 def hidden_parts(resolution: int) -> Bool[np.ndarray, "part x y z"]:
@@ -63,23 +66,32 @@ def turned(grid: Array, quarters: int) -> Array:
     return jnp.rot90(grid, quarters, axes=(-3, -1))
 
 
-@jax.jit
-def predict_hidden(prior: ShapePrior, grids: Grids) -> Predicted:
-    """Score the predictions of a prior for hidden parts, for each front.
+def _standing(grid: Array, stance: Stance) -> Array:
+    """A grid `[... x y z]` in a stance."""
+    return turned(jnp.flip(grid, -2) if stance.is_upside_down else grid, stance.quarters)
 
-    All hidden parts of all objects in all turns go through one call of the decoder.
+
+@partial(jax.jit, static_argnums=2)
+def predict_hidden(
+    prior: ShapePrior, grids: Grids, stances: tuple[Stance, ...] = UPRIGHT
+) -> Float[Array, "object stance"]:
+    """Score the predictions of a prior for hidden parts, for each stance.
+
+    All hidden parts of all objects in all stances go through one call of the decoder.
 
     Args:
         prior: The shape prior.
         grids: F and M of each object `[object x y z]`.
+        stances: The stances.
 
     Returns:
-        Scores `[object turn]`.
+        Log-likelihood of the hidden surface voxels, in nats per voxel: the mean over the voxels of
+        each hidden part, then over the parts.
     """
     F, M = (
-        jnp.stack([turned(jnp.float32(x), k) for k in range(TURNS)], axis=1)[:, :, None]
+        jnp.stack([_standing(jnp.float32(x), one) for one in stances], axis=1)[:, :, None]
         for x in grids[:2]
-    )  # [object turn 1 x y z]
+    )  # [object stance 1 x y z]
     hidden = jnp.asarray(hidden_parts(F.shape[-1]))  # [part x y z]
     shape = jnp.broadcast_shapes(F.shape, hidden.shape)
     rows = Grids(
@@ -88,33 +100,8 @@ def predict_hidden(prior: ShapePrior, grids: Grids) -> Predicted:
     )
     code = encode(prior, rows)
     logits = decode(prior, code, rows if prior.model.conditional else None).reshape(shape)
-    return _scored(logits, F, (1 - M) * hidden)
-
-
-def _scored(
-    logits: Float[Array, "object turn part x y z"],
-    F: Float[Array, "object turn 1 x y z"],
-    known: Float[Array, "object turn part x y z"],
-) -> Predicted:
-    axes = (-3, -2, -1)
-
-    def mean(values, weight):
-        total = jnp.sum(weight, axes)
-        found = jnp.sum(values * weight, axes) / jnp.maximum(total, 1e-6)
-        counts = total > 1  # a part in which nothing was measured says nothing
-        return jnp.sum(jnp.where(counts, found, 0), -1) / jnp.maximum(counts.sum(-1), 1)
-
-    occupied, free = -jax.nn.softplus(-logits), -jax.nn.softplus(logits)
-    p = jax.nn.sigmoid(logits)
-    surface, empty = F * known, (1 - F) * known
-    both = jnp.sum(jnp.where(p > 0.5, surface, 0), axes)
-    either = jnp.sum(jnp.where(p > 0.5, known, surface), axes)
-    expected = p * occupied + (1 - p) * free
-    got = F * occupied + (1 - F) * free
-    nearby = known * jnp.maximum(p, F)  # most of a grid is free space and easy to predict
-    return Predicted(
-        surface=mean(occupied, surface),
-        free=mean(free, empty),
-        overlap=jnp.mean(both / jnp.maximum(either, 1e-6), -1),
-        surprise=mean(got - expected, nearby),
-    )
+    surface = F * (1 - M) * hidden
+    total = jnp.sum(surface, (-3, -2, -1))
+    found = jnp.sum(jax.nn.log_sigmoid(logits) * surface, (-3, -2, -1)) / jnp.maximum(total, 1e-6)
+    counts = total > 1  # a part in which nothing was measured says nothing
+    return jnp.sum(jnp.where(counts, found, 0), -1) / jnp.maximum(counts.sum(-1), 1)

@@ -13,6 +13,9 @@ from jaxshape.mapping.scene.boxing import turned_box
 from jaxshape.mapping.scene.classes import UNUSUAL, decide, decided, deviation, unfilled
 from jaxshape.mapping.scene.evidence import TURNS, hidden_parts, predict_hidden, turned
 
+CLEAR = np.array([-1.4, -1.0, -1.5, -1.4])
+"""Log-likelihoods of a chair with its front at the second side."""
+
 
 @pytest.fixture(scope="module")
 def meshes():
@@ -98,7 +101,7 @@ def test_scores_are_means_over_the_hidden_voxels(priors):
         np.mean(-np.log1p(np.exp(-x[hidden & (F > 0)])))
         for x, hidden in zip(logits, hidden_parts(32), strict=True)
     ]
-    assert float(found.surface[0, 0]) == pytest.approx(np.mean(slow), rel=1e-3)
+    assert float(found[0, 0]) == pytest.approx(np.mean(slow), rel=1e-3)
 
 
 def test_nothing_is_added_to_an_object_of_no_class(priors):
@@ -109,27 +112,30 @@ def test_nothing_is_added_to_an_object_of_no_class(priors):
 
 
 def test_a_decision_needs_more_than_the_best_of_bad_answers():
-    worse = decided({"chair": _scores([-3.0, -4, -4, -4])})
+    worse = decided({"chair": np.array([-3.0, -4, -4, -4])})
     assert worse.name is None
-    clear = decided({"chair": _scores([-1.4, -1.0, -1.5, -1.4]), "table": _scores([-1.6] * 4)})
+    clear = decided({"chair": CLEAR, "table": np.full(8, -0.5)})
     assert (clear.name, clear.quarters) == ("chair", 1)
-    tied = decided({"chair": _scores([-1.0] * 4), "table": _scores([-1.0] * 4)})
+    tied = decided({"chair": np.full(4, -1.0), "table": np.full(8, -1.0)})
     assert tied.name is None
+
+
+def test_a_confident_prior_does_not_win_every_object():
+    """Likelihoods count against those of wrong stances of the same prior."""
+    on_legs = np.array([-0.6, -0.7, -0.6, -0.7, -0.9, -0.9, -0.9, -0.9])
+    beside = np.full(4, -0.1)  # more likely from all sides
+    table = decided({"chair": beside, "table": on_legs})
+    assert (table.name, table.sure > 0.9) == ("table", True)
+    assert decided({"chair": beside, "table": np.roll(on_legs, 4)}).name is None
+    assert decided({"chair": CLEAR, "table": on_legs}).name == "chair"  # it has a front
 
 
 def test_an_object_of_no_usual_size_is_of_no_class():
     """A strip of wall, 0.2 m by 1.35 m, is no chair, however well it is predicted."""
-    found = {"chair": _scores([-1.4, -1.0, -1.5, -1.4])}
+    found = {"chair": CLEAR}
     chair, strip = np.array([0.55, 0.85, 0.6]), np.array([0.55, 1.35, 0.2])
     assert decided(found, chair).name == "chair"
     assert decided(found, strip).name is None
     assert deviation("chair", strip, 1) > UNUSUAL > 10 * deviation("chair", chair, 0)
     # The box's x is along the front of an object that is turned by a quarter.
     assert deviation("chair", strip, 1) == deviation("chair", strip[::-1], 0)
-
-
-def _scores(surface):
-    from jaxshape.mapping.scene.evidence import Predicted
-
-    x = np.array(surface)
-    return Predicted(x, 0 * x, 0 * x, 0 * x)
