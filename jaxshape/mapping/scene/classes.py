@@ -160,29 +160,27 @@ def build_classes(
 
 
 class Standard(NamedTuple):
-    """The evidence that an object needs to be of a class.
+    """The evidence that an object needs to be of a class, in nats per hidden surface voxel.
 
     Attributes:
-        least: Least margin, in nats per hidden surface voxel.
+        margin: Least margin.
         spread: Width over which the answer goes from unlikely to likely.
+        likelihood: Least log-likelihood.
     """
 
-    least: float
+    margin: float
     spread: float
+    likelihood: float
 
 
-WITH_FRONT, WITHOUT_FRONT = Standard(0.14, 0.025), Standard(0.065, 0.01)
+WITH_FRONT, WITHOUT_FRONT = Standard(0.14, 0.025, -1.4), Standard(0.065, 0.01, -1.25)
 """Evidence over other fronts, and over the object upside down. It was chosen on procedural chairs
-and tables, boxes, plants, lamps, bins and balls. The median of chairs over other fronts is 0.31,
-that of tables over tables upside down 0.18. Of 48 objects of neither class, none reaches the first,
-and only a box and a few plants the second; most of these plants are too unlikely (`WORST`)."""
+and tables, boxes, plants, lamps, bins and balls. The median margin of chairs over other fronts is
+0.31, that of tables over tables upside down 0.18. Of 48 objects of neither class, none reaches the
+first margin, and only a box and a few plants the second; most of these plants are too unlikely."""
 
 OPPOSITE = 0.5
 """Weight of the margin over the opposite front: backs differ from fronts more than sides do."""
-
-WORST = -1.25
-"""Least log-likelihood of hidden surface voxels for an object to be of any class. It is less for
-balls and for most plants."""
 
 
 UNUSUAL = 14.0
@@ -243,8 +241,8 @@ def decided(
     for name, own in found.items():
         standard = WITHOUT_FRONT if name in FRONTLESS else WITH_FRONT
         is_odd = size is not None and deviation(name, size, fronts[name]) > UNUSUAL
-        most = 0.1 if own[:TURNS].max() < WORST or is_odd else 1.0
-        likely[name] = min(_sigmoid((margins[name] - standard.least) / standard.spread), most)
+        most = 0.1 if own[:TURNS].max() < standard.likelihood or is_odd else 1.0
+        likely[name] = min(_sigmoid((margins[name] - standard.margin) / standard.spread), most)
     scores = {name: round(margin, 3) for name, margin in margins.items()}
     possible = [name for name in found if likely[name] > 0.5]
     if not possible:
