@@ -228,8 +228,9 @@ def decided(
 ) -> Decision:
     """The class and the front of one object, from what each prior predicts.
 
-    Where it may be of several classes, those with a front take precedence: chairs stand on legs as
-    tables do, but no side of a table looks like the front of a chair.
+    Chairs stand on legs as tables do, but no side of a table looks like the front of a chair. So
+    classes with a front take precedence, and an object with half the evidence for one of them is of
+    no class without a front.
 
     Args:
         found: Log-likelihood of hidden surface voxels for each class in its stances (`stances_of`).
@@ -237,17 +238,23 @@ def decided(
     """
     margins = {name: _margin(name, own) for name, own in found.items()}
     fronts = {name: int(own[:TURNS].argmax()) for name, own in found.items()}
+    for_front = max((x for name, x in margins.items() if name not in FRONTLESS), default=0.0)
     likely = {}
     for name, own in found.items():
-        standard = WITHOUT_FRONT if name in FRONTLESS else WITH_FRONT
-        is_odd = size is not None and deviation(name, size, fronts[name]) > UNUSUAL
-        most = 0.1 if own[:TURNS].max() < standard.likelihood or is_odd else 1.0
+        is_frontless = name in FRONTLESS
+        standard = WITHOUT_FRONT if is_frontless else WITH_FRONT
+        is_excluded = (
+            own[:TURNS].max() < standard.likelihood
+            or (is_frontless and for_front > WITH_FRONT.margin / 2)
+            or (size is not None and deviation(name, size, fronts[name]) > UNUSUAL)
+        )
+        most = 0.1 if is_excluded else 1.0
         likely[name] = min(_sigmoid((margins[name] - standard.margin) / standard.spread), most)
     scores = {name: round(margin, 3) for name, margin in margins.items()}
     possible = [name for name in found if likely[name] > 0.5]
     if not possible:
         return Decision(None, 0, 1 - max(likely.values()), scores)
-    best = max(possible, key=lambda name: (name not in FRONTLESS, margins[name]))
+    best = max(possible, key=lambda name: margins[name])
     return Decision(best, fronts[best], likely[best], scores)
 
 

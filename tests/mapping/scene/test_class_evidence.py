@@ -128,6 +128,8 @@ def test_a_confident_prior_does_not_win_every_object():
     assert (table.name, table.sure > 0.9) == ("table", True)
     assert decided({"chair": beside, "table": np.roll(on_legs, 4)}).name is None
     assert decided({"chair": CLEAR, "table": on_legs}).name == "chair"  # it has a front
+    doubtful = np.array([-0.9, -1.0, -1.1, -1.0])  # it may have one
+    assert decided({"chair": doubtful, "table": on_legs}).name is None
 
 
 def test_an_object_of_no_usual_size_is_of_no_class():
