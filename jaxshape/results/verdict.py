@@ -249,10 +249,7 @@ def judged(quality: Quality) -> Verdict:
 
 
 def _failures(q: Quality) -> Iterator[str]:
-    if q.explained < FAILED:
-        yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
-    if q.free_violated > TORN:
-        yield f"{q.free_violated:.0%} of the mesh lies in space that was measured as free"
+    yield from _contradictions(q, FAILED, TORN)
     if not SIZES[0] <= max(q.size) <= SIZES[1]:
         yield f"the object would be {max(q.size):.2g} m large"
     if q.keyframes and 2 * q.empty_keyframes >= q.keyframes:
@@ -264,10 +261,7 @@ def _failures(q: Quality) -> Iterator[str]:
 
 
 def _doubts(q: Quality) -> Iterator[str]:
-    if q.explained < DOUBTFUL:
-        yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
-    if q.free_violated > SEEN_THROUGH:
-        yield f"{q.free_violated:.0%} of the mesh lies in space that was measured as free"
+    yield from _contradictions(q, DOUBTFUL, SEEN_THROUGH)
     if q.measured < LITTLE_MEASURED:
         yield f"only {q.measured:.0%} of the mesh was measured"
     if abs(q.floor_gap) > GAP:
@@ -281,6 +275,14 @@ def _doubts(q: Quality) -> Iterator[str]:
         yield f"the end of the object was not seen at its {joined(sides)}"
     if q.unseen_below > BARE:
         yield f"its lower {q.unseen_below:.0%}, for example the legs, is predicted"
+
+
+def _contradictions(q: Quality, explained: float, free_violated: float) -> Iterator[str]:
+    """What mesh and measurement disagree about, from these shares on."""
+    if q.explained < explained:
+        yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
+    if q.free_violated > free_violated:
+        yield f"{q.free_violated:.0%} of the mesh lies in space that was measured as free"
 
 
 def _unseen_sides(q: Quality) -> tuple[str, ...]:

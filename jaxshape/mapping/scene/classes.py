@@ -238,14 +238,14 @@ def decided(
     """
     margins = {name: _margin(name, own) for name, own in found.items()}
     fronts = {name: int(own[:TURNS].argmax()) for name, own in found.items()}
-    for_front = max((x for name, x in margins.items() if name not in FRONTLESS), default=0.0)
+    front_evidence = max((x for name, x in margins.items() if name not in FRONTLESS), default=0.0)
     likely = {}
     for name, own in found.items():
         is_frontless = name in FRONTLESS
         standard = WITHOUT_FRONT if is_frontless else WITH_FRONT
         is_excluded = (
             own[:TURNS].max() < standard.likelihood
-            or (is_frontless and for_front > WITH_FRONT.margin / 2)
+            or (is_frontless and front_evidence > WITH_FRONT.margin / 2)
             or (size is not None and deviation(name, size, fronts[name]) > UNUSUAL)
         )
         most = 0.1 if is_excluded else 1.0
