@@ -1,6 +1,7 @@
 """Valid entries pass, and each way to be invalid is found; a killed run goes on."""
 
 import copy
+from pathlib import Path
 
 import pytest
 
@@ -8,7 +9,11 @@ from jaxshape.bench import entries
 from jaxshape.bench.config import BenchConfig
 from jaxshape.bench.entries import faults, file_name, read_entries, read_entry, write_entry
 from jaxshape.bench.own_loop import Watch, enter_benchmark
+from jaxshape.bench.problems import problems
 from jaxshape.bench.run import run
+from jaxshape.bench.watching import GRADIENT
+
+BOARD = Path(__file__).parents[2] / "benchmarks" / "board"
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 CONFIG = BenchConfig(budget=64, at_a_time=1)
@@ -32,6 +37,26 @@ def test_a_run_is_valid_and_says_how_it_was_made(entry, two):
     assert entry.about["settings"]["population"] == CONFIG.population
     (machine,) = entry.machines.values()
     assert machine["packages"]["jax"] and {row["together"] for row in entry.rows.values()} == {1}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted(BOARD.glob("*.json")), ids=lambda path: path.stem)
+def test_the_results_on_the_board_are_valid(path):
+    entry, known = read_entry(path), problems()
+    assert faults(entry, known) == [] and len(entry.rows) == len(known)
+
+
+def test_the_last_evaluation_may_go_beyond_the_budget(entry, two):
+    """It counts as a whole, and its result does not count."""
+    one = two[0]
+
+    def said(calls):
+        rows = {one.name: entry.rows[one.name] | {"calls": calls}}
+        return faults(entry._replace(rows=rows), [one])
+
+    matrix = GRADIENT * (1 + one.prior.code_size)
+    assert said(CONFIG.budget + matrix - 1) == []
+    assert "decoder calls of 64" in said(CONFIG.budget + matrix)[0]
 
 
 def test_a_search_that_reached_no_target_is_valid(entry, two):
