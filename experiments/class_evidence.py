@@ -46,7 +46,7 @@ class Config(runs.Config):
 
     count: int = 40
     """Number of objects of each family; of objects of neither class there are twice as many."""
-    tables: Path = Path(__file__).parent / "weights" / "table.safetensors"
+    tables: Path = runs.TABLES
     """Weights for tables."""
 
 

@@ -54,7 +54,7 @@ class Config(runs.Config):
 
     rooms: int = 24
     frames: int = 16
-    tables: Path = Path(__file__).parent / "weights" / "table.safetensors"
+    tables: Path = runs.TABLES
     """Weights for tables."""
 
 

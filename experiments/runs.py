@@ -12,6 +12,8 @@ from jaxshape.data.meshes import MeshSource, list_meshes
 from jaxshape.results.journal import Journal
 
 RESULTS = Path(__file__).parent / "results"
+TABLES = Path(__file__).parent / "weights" / "table.safetensors"
+"""Weights for tables."""
 
 
 @dataclass(frozen=True)

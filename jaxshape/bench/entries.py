@@ -24,13 +24,12 @@ from jaxshape import reading
 from jaxshape.bench.config import LADDER, LEFT
 from jaxshape.bench.machine import describe_machine, load
 from jaxshape.bench.problem_set import NAME, SHA256
-from jaxshape.bench.problems import EQUATION_7, Problem
+from jaxshape.bench.problems import Problem, problem_objective
 from jaxshape.bench.scoring import Row, targets, unpacked_code
 from jaxshape.bench.watching import GRADIENT
 from jaxshape.files import write_text
 from jaxshape.geometry.overlap import iou
 from jaxshape.model.shapes import decode
-from jaxshape.search.objective import objective
 
 FORMAT = "jaxshape-bench-entry-1"
 
@@ -279,7 +278,7 @@ def _fault(row: Row, problem: Problem, budget: int) -> str | None:
 @jax.jit
 def _again(decoder, target, surface, code):
     """Objective and IoU of a code, computed again."""
-    loss = objective(decoder, target, residual=EQUATION_7)(code)
+    loss = problem_objective(decoder, target)(code)
     return loss, iou(decode(decoder, code) > 0, surface)
 
 

@@ -72,7 +72,7 @@ class Problem(NamedTuple):
         Args:
             code: A code `[d]`.
         """
-        return _objective(self.decoder, self.target)(code)
+        return problem_objective(self.decoder, self.target)(code)
 
     def iou(self, code: Float[Array, " d"]) -> Float[Array, ""]:
         """Overlap of the decoded shape with the true surface, 0 to 1.
@@ -104,14 +104,21 @@ def objectives(
         targets: Targets of the problems `[problem ...]`.
         space: Coordinates of the points that the objectives take; None for codes.
     """
-    return lambda number: _objective(decoder, pick(targets, number), space)
+    return lambda number: problem_objective(decoder, pick(targets, number), space)
 
 
-def _objective(decoder: ShapePrior, target: Target, space: LatentSpace | None = None) -> Composed:
+def problem_objective(
+    decoder: ShapePrior, target: Target, space: LatentSpace | None = None
+) -> Composed:
     """The objective of one problem, also inside of branches and loops under `jax.vmap`.
 
     JAX copies what a branch closes over to each element of a batch, which `search.objective` would
     take for several networks. All problems have the same one.
+
+    Args:
+        decoder: The shape prior, its parameters prepared.
+        target: Target of the problem.
+        space: Coordinates of the points that the objective takes; None for codes.
     """
     prepared = decoder.model.prepare(decoder.params, None, "float32")
     own = ObjectTerms(pick(prepared.own, 0), target, jnp.float32(0))
