@@ -22,6 +22,7 @@ from jaxshape.geometry.evidence import from_grids
 from jaxshape.geometry.grids import Grids
 from jaxshape.geometry.symmetry import mirror
 from jaxshape.model.config import Completion
+from jaxshape.model.convolution import multiplies_bfloat16
 from jaxshape.model.shapes import Precision, Prepared, ShapeModel
 from jaxshape.model.stencil import convolve, multiply
 
@@ -227,12 +228,14 @@ def encode(params: PyTree, grids: Grids) -> Float[Array, "b d"]:
 def prepare(params: PyTree, grids: Grids | None, precision: Precision) -> Prepared:
     """Features of each object's measurement and of its mirror image.
 
-    Without a measurement, all voxels are unknown.
+    Without a measurement, all voxels are unknown. A CPU without matrix units for bfloat16 is faster
+    in float32, which it then uses for both precisions.
     """
     if grids is None:
         n = architecture_of(params).resolution
         grids = Grids(jnp.zeros((1, n, n, n)), jnp.ones((1, n, n, n)))
-    dtype = jnp.bfloat16 if precision == "bfloat16" else jnp.float32
+    pays = jax.default_backend() != "cpu" or multiplies_bfloat16()
+    dtype = jnp.bfloat16 if precision == "bfloat16" and pays else jnp.float32
     sides = [skips(params, Grids(*side)) for side in (grids[:2], map(mirror, grids[:2]))]
     own = jax.tree.map(lambda x: x.astype(dtype), sides)
     return Prepared({"decoder": params["decoder"]}, own)
