@@ -76,6 +76,8 @@ def over_rows(score: Score, at_a_time: Mapping[str, int] = ROWS_AT_A_TIME) -> Ca
         (`one_network`).
     """
 
+    score = jax.jit(score, inline=True)
+
     @custom_vmap
     def scored(shared, codes, own, owner):
         branches = {
