@@ -10,6 +10,7 @@ carry over between machines far better than times do.
 """
 
 NAMES = (
-    "fusion", "decode", "refinement", "training", "scaling", "startup", "precision", "tracking"
+    "fusion", "completion", "decode", "refinement", "training", "scaling", "startup", "precision",
+    "tracking",
 )  # fmt: skip
 """The benchmarks, in the order they run."""

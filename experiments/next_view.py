@@ -10,7 +10,7 @@ elevation, random cameras, and the camera farthest from all earlier ones. Sample
 the conditional prior, drawn anew after each view.
 
 Results: experiments/results/next_view.json, .png and .svg; a finished seat is not run again.
-Time: 40 minutes on two cores.
+Time: 5 minutes on one core.
 """
 
 import time

@@ -3,8 +3,8 @@ r"""Are probabilities reliable? Calibration in occluded voxels, and the gain fro
     python experiments/uncertainty.py --seats cad_chairs --tables cad_tables
 
 Shapes are completed from 1, 4 and 8 noisy frames of a Kinect along an orbit. Every way to estimate
-the probability of a voxel has its own calibration, fitted to procedural chairs that are neither in
-the training nor in the test:
+the probability of a voxel has its own calibration, fitted to procedural objects of the network's
+class that are neither in the training nor in the test:
 
 - decoder: the logits of the shape, with slope and offset (Platt scaling);
 - conditional prior: the slope falls with the spread of 16 shapes whose codes are drawn from the
@@ -73,11 +73,13 @@ class Config(runs.Config):
     chairs: int = 96
     """Procedural chairs kept for tests."""
     calibration: int = 48
-    """Procedural chairs that calibrations are fitted to."""
+    """Procedural objects that calibrations are fitted to."""
     searched: int = 12
     """Number of calibration chairs and of CAD seats in the auto-encoder's rows."""
     weights: Path | None = None
-    """Weights of the conditional network; the package's weights by default."""
+    """Weights of the conditional network for chairs; the package's weights by default."""
+    table_weights: Path = runs.TABLES
+    """Weights of the conditional network for tables."""
 
 
 class Voxels(NamedTuple):
@@ -181,10 +183,10 @@ def pooled(parts: Sequence[Voxels]) -> Voxels:
 # ------------------------------------------------------------------ the comparison
 
 
-def compared(config: Config, sets: dict[str, Seen], chairs: Seen) -> dict[str, Any]:
-    """Figures of the conditional network, by set, number of frames and way."""
-    look = partial(voxels, partial(samples, "encoder"), load_prior(config.weights))
-    calibrating = pooled([look(chairs, i) for i in range(len(FRAMES))])
+def compared(weights: Path | None, sets: dict[str, Seen], fitted: Seen) -> dict[str, Any]:
+    """Figures of a conditional network, by set, number of frames and way."""
+    look = partial(voxels, partial(samples, "encoder"), load_prior(weights))
+    calibrating = pooled([look(fitted, i) for i in range(len(FRAMES))])
     ways = {
         "decoder as it is": (without_spread, Calibration()),
         "decoder": (without_spread, fit(*without_spread(calibrating))),
@@ -278,16 +280,24 @@ def plot(figures: dict[str, Any], path: Path) -> None:
             row[0].set_ylabel("share that is occupied")
 
 
+def kept(family: str, config: Config) -> Seen:
+    """Procedural objects to fit calibrations to."""
+    return cases_of(procedural_objects(family, config.calibration, FIRST_SEED))
+
+
 def main(config: Config) -> None:
     config = config.reduced(chairs=0, calibration=6, searched=2)
-    chairs = cases_of(procedural_objects("chair", config.calibration, FIRST_SEED))
+    chairs, few = kept("chair", config), config.searched
     sets = {"CAD seats": cases_of(listed(config.seats, 0))}
-    if config.tables is not None:
-        sets["CAD tables"] = cases_of(listed(config.tables, 0))
     if config.chairs:
         sets["procedural chairs"] = cases_of(listed(None, config.chairs))
-    found = compared(config, sets, chairs)
-    few = config.searched
+    tables = {} if config.tables is None else {"CAD tables": cases_of(listed(config.tables, 0))}
+    others = {f"{name}, network for chairs": cases for name, cases in tables.items()}
+    found = compared(config.weights, sets | others, chairs)
+    if tables:
+        own = compared(config.table_weights, tables, kept("table", config))
+        found["figures"] |= own["figures"]
+        found["calibrations of tables"] = own["calibrations"]
     found["auto-encoder"] = searched(sets["CAD seats"][:few], chairs[:few])
     name = two_kinds(config, sets["CAD seats"], config.results / "uncertainty_hypotheses.png")
     write_json(config.results / "uncertainty.json", found | {"two kinds": name})
