@@ -6,6 +6,7 @@ Each room has a floor, a wall, and 3 to 6 objects: procedural chairs and tables 
 trained on, and objects of neither class. The images have a Kinect's noise and 320 x 240 pixels; the
 given poses err by 4 mm and 0.3 degrees. An object is found if its box overlaps the true one by a
 quarter. IoU compares the mesh's voxels with the true voxels, 32 along each side of the true box.
+Further rooms hold one chair alone: they give the time that one object takes.
 
 Results: experiments/results/rooms.json, room by room, and rooms.png: a killed run resumes.
 """
@@ -53,6 +54,8 @@ class Config(runs.Config):
     """Settings of the experiment."""
 
     rooms: int = 24
+    alone: int = 4
+    """Rooms with one chair alone, for the time that one object takes."""
     frames: int = 16
     tables: Path = runs.TABLES
     """Weights for tables."""
@@ -69,7 +72,7 @@ class Placed(NamedTuple):
 
 def main(config: Config) -> None:
     prepare_process()
-    config = config.reduced(rooms=1, frames=4)
+    config = config.reduced(rooms=1, alone=0, frames=4)
     journal = run(config)
     draw(journal.rows, config.results / "rooms.png")
     print(json.dumps(summary(journal.rows), indent=1))
@@ -80,7 +83,9 @@ def run(config: Config) -> Journal:
     journal = config.journal("rooms", frames=config.frames)
     priors = {"chair": load_prior("chair"), "table": load_prior(config.tables)}
     classes = build_classes(priors, placers={"chair": load_prior("chair-autoencoder")})
-    tasks = {str(i): partial(one_room, i, config.frames, classes) for i in range(config.rooms)}
+    room = partial(one_room, frames=config.frames, classes=classes)
+    tasks = {str(i): partial(room, furnished(i), i) for i in range(config.rooms)}
+    tasks |= {f"chair {i} alone": partial(room, furnished(i)[:1], i) for i in range(config.alone)}
     runs.complete(journal, tasks, summary, json.dumps)
     return journal
 
@@ -88,9 +93,10 @@ def run(config: Config) -> Journal:
 # One room ---------------------------------------------------------------------------------------
 
 
-def one_room(number: int, frames: int, classes: SceneClasses) -> dict[str, Any]:
-    """Figures of a room."""
-    truth = furnished(number)
+def one_room(
+    truth: list[Placed], number: int, frames: int, classes: SceneClasses
+) -> dict[str, Any]:
+    """Figures of a room with these objects."""
     with tempfile.TemporaryDirectory() as folder:
         record(Path(folder), truth, frames, number)
         sequence = open_sequence(folder)
@@ -260,8 +266,9 @@ def mesh_iou(one: Placed, found: SceneObject) -> float:
     return float(iou(*grids))
 
 
-def summary(rooms: dict[str, Any]) -> dict[str, Any]:
+def summary(rows: dict[str, Any]) -> dict[str, Any]:
     """Means over all rooms, by class; yaw errors of tables are modulo half a turn."""
+    rooms = of_several(rows)
     objects = [one for room in rooms.values() for one in room["objects"]]
     false = [one for room in rooms.values() for one in room["false"]]
     figures: dict[str, Any] = {
@@ -279,12 +286,17 @@ def summary(rooms: dict[str, Any]) -> dict[str, Any]:
         right = [one for one in found if (one.get("class") or "neither") == kind]
         if right:
             figures[kind] |= _errors(kind, right)
-    times = {n: [room["cpu_seconds"] for room in rooms.values() if len(room["objects"]) == n]
-             for n in range(3, 7)}  # fmt: skip
+    times = {n: [room["cpu_seconds"] for room in rows.values() if len(room["objects"]) == n]
+             for n in range(1, 7)}  # fmt: skip
     figures["seconds by objects"] = {
         str(n): round(float(np.median(those)), 1) for n, those in times.items() if those
     }
     return {"summary": figures}
+
+
+def of_several(rows: dict[str, Any]) -> dict[str, Any]:
+    """The rooms in which the objects are not alone."""
+    return {name: room for name, room in rows.items() if len(room["objects"]) > 1}
 
 
 def kind_of(one: dict[str, Any]) -> str:
@@ -304,8 +316,9 @@ def _errors(kind: str, right: list[dict[str, Any]]) -> dict[str, float]:
     }
 
 
-def draw(rooms: dict[str, Any], path: Path) -> None:
+def draw(rows: dict[str, Any], path: Path) -> None:
     """Draw the decided class of each kind, and the IoU of the objects that were found."""
+    rooms = of_several(rows)
     objects = [one for room in rooms.values() for one in room["objects"]]
     kinds, classes = ["chair", "table", *KINDS], ["chair", "table", "None", "not found"]
     counts = np.zeros((len(kinds), len(classes)), int)

@@ -33,7 +33,7 @@ import tyro
 
 import runs
 from figures import drawn
-from jaxshape.data.families import procedural_objects
+from jaxshape.data.families import FamilyName, procedural_objects
 from jaxshape.files import write_json
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.calibration import Calibration
@@ -280,7 +280,7 @@ def plot(figures: dict[str, Any], path: Path) -> None:
             row[0].set_ylabel("share that is occupied")
 
 
-def kept(family: str, config: Config) -> Seen:
+def kept(family: FamilyName, config: Config) -> Seen:
     """Procedural objects to fit calibrations to."""
     return cases_of(procedural_objects(family, config.calibration, FIRST_SEED))
 

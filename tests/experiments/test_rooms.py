@@ -43,7 +43,9 @@ def test_a_summary_counts_what_is_found_classed_and_wrong():
         "false": [{"class": "chair"}],
         "cpu_seconds": 2.0,
     }
-    found = summary({"0": room})["summary"]
+    alone = {"objects": [one("chair", "table")], "false": [], "cpu_seconds": 0.5}
+    found = summary({"0": room, "chair 0 alone": alone})["summary"]
+    assert found["seconds by objects"] == {"1": 0.5, "3": 2.0} and found["rooms"] == 1
     assert found["chair"]["classed chair"] == 1 and found["chair"]["yaw median"] == 10
     assert found["neither"]["classed None"] == 1 and found["table"]["found"] == 0
     assert found["false objects of a class"] == 1
