@@ -16,7 +16,7 @@ def in_chunks(function: Callable[..., PyTree], size: int, *examples: Array) -> P
     and their results are dropped.
     """
     b = examples[0].shape[0]
-    chunks = -(-b // size)
+    chunks = _count(b, size)
     if chunks <= 1:
         return function(*examples)
     each = -(-b // chunks)
@@ -29,7 +29,7 @@ def sum_chunks(function: Callable[..., Array], size: int, *examples: Array) -> A
 
     The function must be additive over examples, and 0 for examples of zeros.
     """
-    chunks = -(-examples[0].shape[0] // size)
+    chunks = _count(examples[0].shape[0], size)
     each = -(-examples[0].shape[0] // max(chunks, 1))
     split = [_split(x, chunks, each) for x in examples]
     out: Any = jax.eval_shape(function, *[x[0] for x in split])
@@ -61,6 +61,17 @@ def _axes_of(x: Any) -> frozenset[str]:
     """Axes along which an array may differ; their name depends on the version of JAX."""
     kind: Any = jax.typeof(x)
     return kind.vma if hasattr(kind, "vma") else kind.manual_axis_type.varying
+
+
+def _count(b: int, size: int) -> int:
+    """Number of chunks of at most `size` of b examples.
+
+    It is the lowest one, or one up to a half higher that divides b: filling up the last chunk
+    copies all examples.
+    """
+    fewest = -(-b // size)
+    even = (n for n in range(fewest, fewest * 3 // 2 + 1) if n and b % n == 0)
+    return next(even, fewest)
 
 
 def _split(x: Array, chunks: int, each: int) -> Array:
