@@ -3,25 +3,38 @@
 Against the same network in PyTorch, in its fastest variant.
 """
 
+import math
+import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
 from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
 
 import jaxshape as js
 from benchmarks import problems
-from benchmarks.harness import Metric, alternate, compiled, difference, fastest, optional, speedup
+from benchmarks.harness import (
+    Metric,
+    alternate,
+    compiled,
+    difference,
+    fastest,
+    in_fresh_process,
+    optional,
+    speedup,
+)
 from benchmarks.problems import PRECISIONS, Problem
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.completion import evidence_of
 from jaxshape.model.config import PRESETS, Precision
 from jaxshape.model.families import Batch
 from jaxshape.model.shapes import decode_prepared, pick
-from jaxshape.model.training import initial_state, train_step
+from jaxshape.model.training import _parallel_step, initial_state
 
 OBJECTS, POPULATIONS, BATCH = (1, 16), (17, 64), 32
 LAYOUTS = {"contiguous": False, "channels last": True}
@@ -38,7 +51,7 @@ def run(quick: bool) -> list[Metric]:
     for precision in PRECISIONS:
         for population in POPULATIONS:
             metrics += _score(prior, problems.chairs(1), population, precision, budget)
-        metrics += _train(prior, problems.chairs(4), precision, 2 * budget)
+        metrics += _train(precision, 2 * budget)
     return metrics
 
 
@@ -108,10 +121,20 @@ def _score(
     )
 
 
-def _train(
-    prior: js.ShapePrior, problem: Problem, precision: Precision, budget: float
-) -> list[Metric]:
-    """One step of Adam on the evidence bound of 32 pairs."""
+def _train(precision: Precision, budget: float) -> list[Metric]:
+    """One step of Adam on the evidence bound of 32 pairs, in a process whose cores are devices."""
+    devices = math.gcd(BATCH, os.cpu_count() or 1)
+    metrics = in_fresh_process(
+        "benchmarks.completion:training_step",
+        precision,
+        budget,
+        JAX_NUM_CPU_DEVICES=str(devices),
+    )
+    return [Metric(**one) for one in metrics]
+
+
+def training_step(precision: Precision, budget: float) -> list[dict[str, Any]]:
+    """Metrics of a training step that is spread over the cores, as `jaxshape train` spreads it."""
     config = replace(
         PRESETS["default"],
         batch=BATCH,
@@ -119,10 +142,20 @@ def _train(
         average=0.0,
         bfloat16=precision == "bfloat16",
     )
+    prior, problem = js.load_prior("chair"), problems.chairs(4)
     tile = lambda x: np.tile(np.array(x), (BATCH // 4, 1, 1, 1))  # noqa: E731
     batch = Batch(*(tile(x).astype(np.float32) for x in problem[1:3]), tile(problem.surface))
+    mesh = jax.make_mesh((jax.device_count(),), ("batch",))
+    spread = jax.device_put(batch, NamedSharding(mesh, P("batch")))
     state = initial_state(config)._replace(variables={"params": prior.params})
-    ours, compile_seconds = compiled(partial(train_step, config=config), state, batch)
+    state = jax.device_put(state, NamedSharding(mesh, P()))
+    step, compile_seconds = compiled(_parallel_step(config, mesh), state, spread)
+
+    def ours():
+        nonlocal state
+        state, figures = step(state, spread)  # the state before the step is used up
+        return figures
+
     rivals = {}
     if torch := optional("pytorch_completion"):
         network = torch.from_jaxshape(prior.params)
@@ -138,14 +171,9 @@ def _train(
             )
             for name, last in LAYOUTS.items()
         }
-    return _against(
-        f"completion/training/{precision}",
-        partial(ours, state, batch),
-        compile_seconds,
-        rivals,
-        budget,
-        target=1.0,
-    )
+    name = f"completion/training/{precision}"
+    metrics = _against(name, ours, compile_seconds, rivals, budget, target=1.0)
+    return [asdict(one) for one in metrics]
 
 
 def _channels_first(grids: Grids) -> np.ndarray:
