@@ -1,20 +1,15 @@
-"""The default network, conditioned on the measurement: completing, scoring codes, a training step.
+"""The default network, conditioned on the measurement: completing, and scoring codes.
 
 Against the same network in PyTorch, in its fastest variant.
 """
 
-import math
-import os
 from collections.abc import Callable
-from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
 from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import NamedSharding
-from jax.sharding import PartitionSpec as P
 
 import jaxshape as js
 from benchmarks import problems
@@ -24,25 +19,22 @@ from benchmarks.harness import (
     compiled,
     difference,
     fastest,
-    in_fresh_process,
     optional,
     speedup,
 )
 from benchmarks.problems import PRECISIONS, Problem
 from jaxshape.geometry.grids import Grids
 from jaxshape.model.completion import evidence_of
-from jaxshape.model.config import PRESETS, Precision
-from jaxshape.model.families import Batch
+from jaxshape.model.config import Precision
 from jaxshape.model.shapes import decode_prepared, pick
-from jaxshape.model.training import _parallel_step, initial_state
 
-OBJECTS, POPULATIONS, BATCH = (1, 16), (17, 64), 32
+OBJECTS, POPULATIONS = (1, 16), (17, 64)
 LAYOUTS = {"contiguous": False, "channels last": True}
 TARGETS = {"float32": 1.3, "bfloat16": 1.0}
 """Times faster than PyTorch in completing and in scoring codes."""
 
 LIMITS = {"float32": 2e-5, "bfloat16": 1e-2}
-"""Differences of objectives and losses, in nats per voxel, that rounding explains."""
+"""Differences of the objective, in nats per voxel, that rounding explains."""
 
 
 def run(quick: bool) -> list[Metric]:
@@ -51,7 +43,6 @@ def run(quick: bool) -> list[Metric]:
     for precision in PRECISIONS:
         for population in POPULATIONS:
             metrics += _score(prior, problems.chairs(1), population, precision, budget)
-        metrics += _train(precision, 2 * budget)
     return metrics
 
 
@@ -119,61 +110,6 @@ def _score(
         limit=LIMITS[precision],
         exact=exact,
     )
-
-
-def _train(precision: Precision, budget: float) -> list[Metric]:
-    """One step of Adam on the evidence bound of 32 pairs, in a process whose cores are devices."""
-    devices = math.gcd(BATCH, os.cpu_count() or 1)
-    metrics = in_fresh_process(
-        "benchmarks.completion:training_step",
-        precision,
-        budget,
-        JAX_NUM_CPU_DEVICES=str(devices),
-    )
-    return [Metric(**one) for one in metrics]
-
-
-def training_step(precision: Precision, budget: float) -> list[dict[str, Any]]:
-    """Metrics of a training step that is spread over the cores, as `jaxshape train` spreads it."""
-    config = replace(
-        PRESETS["default"],
-        batch=BATCH,
-        optimizer="adam",
-        average=0.0,
-        bfloat16=precision == "bfloat16",
-    )
-    prior, problem = js.load_prior("chair"), problems.chairs(4)
-    tile = lambda x: np.tile(np.array(x), (BATCH // 4, 1, 1, 1))  # noqa: E731
-    batch = Batch(*(tile(x).astype(np.float32) for x in problem[1:3]), tile(problem.surface))
-    mesh = jax.make_mesh((jax.device_count(),), ("batch",))
-    spread = jax.device_put(batch, NamedSharding(mesh, P("batch")))
-    state = initial_state(config)._replace(variables={"params": prior.params})
-    state = jax.device_put(state, NamedSharding(mesh, P()))
-    step, compile_seconds = compiled(_parallel_step(config, mesh), state, spread)
-
-    def ours():
-        nonlocal state
-        state, figures = step(state, spread)  # the state before the step is used up
-        return figures
-
-    rivals = {}
-    if torch := optional("pytorch_completion"):
-        network = torch.from_jaxshape(prior.params)
-        noise = np.random.default_rng(0).normal(size=(BATCH, prior.code_mean.size))
-        seen = _channels_first(batch.grids)
-        rivals = {
-            name: partial(
-                torch.trainer(network, channels_last=last, bfloat16=config.bfloat16),
-                seen,
-                np.array(batch.occluded),
-                np.array(batch.surface),
-                noise,
-            )
-            for name, last in LAYOUTS.items()
-        }
-    name = f"completion/training/{precision}"
-    metrics = _against(name, ours, compile_seconds, rivals, budget, target=1.0)
-    return [asdict(one) for one in metrics]
 
 
 def _channels_first(grids: Grids) -> np.ndarray:

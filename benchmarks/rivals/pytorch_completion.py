@@ -274,22 +274,18 @@ def trainer(
     *,
     channels_last: bool = False,
     bfloat16: bool = False,
-    occupied_weight: float = 1.5,
-    occluded_weight: float = 2.0,
     learning_rate: float = 1e-3,
 ) -> Callable[..., float]:
     """One step of Adam on the evidence bound; gives the loss."""
     network = _laid_out(network, channels_last).train()  # type: ignore[assignment]
     adam = torch.optim.Adam(network.parameters(), learning_rate, (0.9, 0.999), fused=True)
 
-    def step(evidence, occluded, surface, noise) -> float:
-        tensors = [torch.as_tensor(x, device=DEVICE) for x in (evidence, occluded, surface, noise)]
-        seen, hidden, truth, normal = (x.float() for x in tensors)
+    def step(evidence, surface, noise) -> float:
+        tensors = [torch.as_tensor(x, device=DEVICE) for x in (evidence, surface, noise)]
+        seen, truth, normal = (x.float() for x in tensors)
         with torch.autocast(DEVICE, torch.bfloat16, enabled=bfloat16):
             logits, nats = network(seen, truth, normal)
-            weight = torch.where(truth > 0, occupied_weight, 1.0)
-            weight = weight * (1 + (occluded_weight - 1) * hidden)
-            loss = F.binary_cross_entropy_with_logits(logits.float(), truth, weight)
+            loss = F.binary_cross_entropy_with_logits(logits.float(), truth)
             loss = loss + nats / truth.numel()
         adam.zero_grad()
         loss.backward()

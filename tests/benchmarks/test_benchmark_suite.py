@@ -17,10 +17,9 @@ import jaxshape as js
 from benchmarks import NAMES, __main__, decode, fusion, harness
 from benchmarks.harness import Metric
 from benchmarks.rivals import numpy_fusion
-from jaxshape.model.completion import COMPLETION, evidence_of
+from jaxshape.model.completion import COMPLETION, evidence_of, initialize
 from jaxshape.model.config import Architecture, Completion, TrainConfig
-from jaxshape.model.families import Batch
-from jaxshape.model.training import _noise, initial_state, train_step
+from jaxshape.model.families import COMPLETIONS, Batch
 
 IMAGE = (48, 64)
 
@@ -144,16 +143,18 @@ def test_decoding_and_scoring_in_pytorch_is_ours(prior):
 def test_the_conditional_network_in_pytorch_is_ours():
     """Completing, the objective of codes, and the loss of a training step."""
     rival = pytest.importorskip("benchmarks.rivals.pytorch_completion")
-    config = TrainConfig(Completion((16, 24, 32), 2, 10), optimizer="adam", average=0.0, batch=2)
-    state = initial_state(config)
-    params = jax.tree.map(_stirred, state.variables["params"])
+    config = TrainConfig(
+        Completion((16, 24, 32), 2, 10), batch=2, occupied_weight=1.0, occluded_weight=1.0
+    )
+    params = jax.jit(initialize, static_argnums=1)(jax.random.key(0), config.architecture)
+    params = jax.tree.map(_stirred, params)
     rng = np.random.default_rng(0)
     occupied, occluded = rng.random((2, 2, 32, 32, 32), np.float32)
     grids, surface = js.Grids(occupied, occluded), rng.random(occupied.shape) < 0.1
     seen = np.moveaxis(np.array(evidence_of(grids)), -1, 1).copy()
     network = rival.from_jaxshape(params)
 
-    prepared = COMPLETION.prepare(params, grids, "float32")
+    prepared = jax.jit(COMPLETION.prepare, static_argnums=2)(params, grids, "float32")
     logits = jax.jit(COMPLETION.decode)(prepared, jnp.zeros((2, 10)))
     assert float(jnp.std(logits)) > 0.1
     for last in (False, True):
@@ -164,17 +165,19 @@ def test_the_conditional_network_in_pytorch_is_ours():
     codes = rng.normal(size=(3, 10)).astype(np.float32)
     target = js.Target(*rng.random((2, 32, 32, 32), np.float32))
     one = jax.tree.map(lambda x: x[0], grids)
-    losses = jax.vmap(js.objective(prior, target, grids=one))(codes)
+    score = lambda codes: jax.vmap(js.objective(prior, target, grids=one))(codes)  # noqa: E731
+    losses = jax.jit(score)(codes)
     for last, size in itertools.product((False, True), (None, 2)):
         score = rival.scorer(network, seen[0], *target, channels_last=last, at_a_time=size)
         np.testing.assert_allclose(score(codes), losses, rtol=1e-5)
     rough = rival.scorer(network, seen[0], *target, bfloat16="cast")(codes)
     np.testing.assert_allclose(rough, losses, rtol=0.05)
 
-    state = state._replace(variables={"params": params})
-    noise = np.array(_noise(state.step, 2, config, None))
-    loss = train_step(state, Batch(occupied, occluded, surface), config)[1][0]
-    theirs = rival.trainer(network)(seen, occluded, surface, noise)
+    noise = rng.normal(size=(2, 10)).astype(np.float32)
+    cost = jax.jit(COMPLETIONS.cost, static_argnames=("config", "axis"))
+    batch = Batch(occupied, occluded, surface)
+    loss = cost({"params": params}, batch, noise, config=config, axis=None).loss
+    theirs = rival.trainer(network)(seen, surface, noise)
     np.testing.assert_allclose(theirs, loss, rtol=1e-5)
 
 
