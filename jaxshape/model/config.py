@@ -125,9 +125,8 @@ class TrainConfig:
         posterior_share: Share of each batch for which the conditional network decodes a code of the
             posterior, from 0 to 1; the others decode its first code. At 0 codes carry no
             information.
-        bfloat16: Compute convolutions in bfloat16: the conditional network then trains 3 to 4 times
-            as fast if the processor has matrix units for it. Parameters, statistics and the
-            optimiser stay in float32.
+        bfloat16: Compute convolutions in bfloat16, which is faster, above all on processors with
+            matrix units for it. Parameters, statistics and the optimiser stay in float32.
         validation: Number of the dataset's last objects that are kept out of training and completed
             for each report, 0 or more; at most a tenth of the dataset.
         report_every: Steps between checkpoints and lines of metrics, 1 or more; a killed run goes
