@@ -95,7 +95,12 @@ def initialize(key: PRNGKeyArray, architecture: Completion) -> PyTree:
 
 
 class _Normal(NamedTuple):
-    """Weights that are to be drawn from a normal distribution of mean 0."""
+    """Weights that are to be drawn from a normal distribution of mean 0.
+
+    Attributes:
+        shape: Shape of the array.
+        deviation: Standard deviation.
+    """
 
     shape: tuple[int, ...]
     deviation: float
