@@ -9,7 +9,7 @@ Likelihoods of different priors are not compared: a network that is better train
 confident, would win every object.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -77,7 +77,8 @@ class Decision(NamedTuple):
         quarters: Quarters of a turn by which its front is turned from that of its box.
         sure: Probability of the answer, from 0 to 1.
         scores: Evidence for each class, in nats per hidden surface voxel: the margin of the
-            likelihood under its prior over that in a wrong stance.
+            likelihood under its prior over that in a wrong stance. A class without a front has none
+            where the size or the likelihood alone excludes it.
     """
 
     name: str | None
@@ -201,17 +202,37 @@ def decide(
         grids: F and M of each object `[object x y z]`, in boxes with any front.
         sizes: Extents of these boxes, in metres; None where objects of any size may be of a class.
     """
-    count = len(grids.occupied)
-    rows = jnp.minimum(jnp.arange(power_of_two(count)), count - 1)
-    padded = Grids(grids.occupied[rows], grids.occluded[rows])
-    found = {
-        name: np.asarray(predict_hidden(prior, padded, stances_of(name)))
-        for name, prior in priors.items()
-    }
-    return [
-        decided({name: of[i] for name, of in found.items()}, None if sizes is None else sizes[i])
-        for i in range(count)
-    ]
+    every = range(len(grids.occupied))
+    found: list[dict[str, np.ndarray]] = [{} for _ in every]
+    for name, prior in priors.items():
+        if name not in FRONTLESS:
+            for i, own in zip(every, _scores(prior, grids, every, UPRIGHT), strict=True):
+                found[i][name] = own
+            continue
+        # Nothing else depends on these classes, so that what cannot be of one is not scored.
+        usual = [i for i in every if sizes is None or _is_usual(name, sizes[i])]
+        upright = _scores(prior, grids, usual, UPRIGHT)
+        likely = [k for k, own in enumerate(upright) if own.max() >= WITHOUT_FRONT.likelihood]
+        toppled = _scores(prior, grids, [usual[k] for k in likely], TOPPLED)
+        for k, own in zip(likely, toppled, strict=True):
+            found[usual[k]][name] = np.concatenate([upright[k], own])
+    return [decided(found[i], None if sizes is None else sizes[i]) for i in every]
+
+
+def _scores(
+    prior: ShapePrior, grids: Grids, which: Sequence[int], stances: tuple[Stance, ...]
+) -> list[Float[np.ndarray, " stance"]]:
+    """Scores of some objects, in one call for a few numbers of objects (`predict_hidden`)."""
+    if not which:
+        return []
+    rows = jnp.array([which[min(k, len(which) - 1)] for k in range(power_of_two(len(which)))])
+    some = Grids(grids.occupied[rows], grids.occluded[rows])
+    return list(np.asarray(predict_hidden(prior, some, stances))[: len(which)])
+
+
+def _is_usual(name: str, size: Float[np.ndarray, " 3"]) -> bool:
+    """Whether an object with its front at some side has the extents of a class."""
+    return min(deviation(name, size, quarters) for quarters in (0, 1)) <= UNUSUAL
 
 
 def stances_of(name: str) -> tuple[Stance, ...]:
@@ -233,7 +254,8 @@ def decided(
     no class without a front.
 
     Args:
-        found: Log-likelihood of hidden surface voxels for each class in its stances (`stances_of`).
+        found: Log-likelihood of hidden surface voxels for each class in its stances (`stances_of`);
+            a class that is missing is excluded.
         size: Extents of the object's box, in metres; None where it may have any size.
     """
     margins = {name: _margin(name, own) for name, own in found.items()}
@@ -253,7 +275,7 @@ def decided(
     scores = {name: round(margin, 3) for name, margin in margins.items()}
     possible = [name for name in found if likely[name] > 0.5]
     if not possible:
-        return Decision(None, 0, 1 - max(likely.values()), scores)
+        return Decision(None, 0, 1 - max(likely.values(), default=0.0), scores)
     best = max(possible, key=lambda name: margins[name])
     return Decision(best, fronts[best], likely[best], scores)
 

@@ -128,8 +128,8 @@ def _beside(index: Int[np.ndarray, "n 3"], met: Int[np.ndarray, "m 3"]) -> Bool[
     low = index.min(axis=0)
     grid = np.zeros(index.max(axis=0) - low + 1, bool)
     grid[tuple((met - low).T)] = True
-    grown = np.asarray(ndimage.binary_dilation(grid, np.ones((3, 3, 3))), bool)
-    return grown[tuple((index - low).T)]
+    grown = ndimage.maximum_filter(grid, 3, mode="constant")  # axis by axis: faster than a dilation
+    return np.asarray(grown[tuple((index - low).T)], bool)
 
 
 def cells_met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
