@@ -54,7 +54,7 @@ class Config(runs.Config):
     """Settings of the experiment."""
 
     rooms: int = 24
-    alone: int = 4
+    alone: int = 8
     """Rooms with one chair alone, for the time that one object takes."""
     frames: int = 16
     tables: Path = runs.TABLES

@@ -35,7 +35,7 @@ from jaxshape.mapping.map.state import grids_of
 from jaxshape.mapping.placement.finding import Start, first_readable, room
 from jaxshape.mapping.scene.boxing import boxed, fits, placed, turned_box
 from jaxshape.mapping.scene.classes import Decision, SceneClasses, decide, unfilled
-from jaxshape.mapping.scene.look import Look, look_around, scene_parts, shown
+from jaxshape.mapping.scene.look import Located, Look, located, look_around, scene_parts, shown
 from jaxshape.mapping.scene.things import Thing, Tracks
 from jaxshape.mapping.scene.world import Level
 from jaxshape.mapping.tracking.keyframes import Cut, PreparedFrame, as_pose, prepare
@@ -168,7 +168,7 @@ def _recut(scene: Scene, looks: list[Look], prepared: PreparedFrame, progress: P
         if not looks:
             keyframes = scene.camera.state.keyframes
             looks.append(look_around(keyframes, (prepared, T), scene.level, scene.tracks))
-        return looks[0].new.parts, jnp.asarray(looks[0].pixels(number))
+        return looks[0].new.keyframe.parts, jnp.asarray(looks[0].pixels(number))
 
     return cut
 
@@ -186,13 +186,14 @@ def _with_look(scene: Scene, look: Look, classes: SceneClasses) -> Scene:
     """The scene with its objects as a look around found them."""
     known = {one.thing.number: one for one in scene.objects}
     scene = scene._replace(level=look.level, tracks=look.tracks)
+    views = [located(one, look.level) for one in shown(scene.camera.state.keyframes)]
     changed, objects = [], []
     for thing in sorted(look.tracks.things, key=lambda one: one.number):
         if thing.is_moved:
             continue
         before = known.get(thing.number)
         one = _appeared(scene, thing) if before is None else before._replace(thing=thing)
-        again = _boxed_anew(scene, one, look, classes)
+        again = _boxed_anew(scene, one, views, classes)
         objects.append(again or one)
         changed += [len(objects) - 1] if again else []
     objects = _refined(objects, changed, classes)
@@ -211,13 +212,12 @@ def _appeared(scene: Scene, thing: Thing) -> SceneObject:
 
 
 def _boxed_anew(
-    scene: Scene, one: SceneObject, look: Look, classes: SceneClasses
+    scene: Scene, one: SceneObject, views: list[Located], classes: SceneClasses
 ) -> SceneObject | None:
     """The object in a new box around its cells; None if the present box still fits."""
     assert scene.level is not None
     progress = one.progress
-    views = shown(scene.camera.state.keyframes)
-    pixels = [look.pixels_in(one.thing, view) for view in views]
+    pixels = [view.pixels(one.thing) for view in views]
     is_new = progress.state.place.box is scene.camera.state.place.box
     before = [np.asarray(k.segmented) for k in progress.state.keyframes]
     if not is_new and fits(progress.start.box, one.thing, scene.level, pixels, before):

@@ -41,6 +41,52 @@ class Shown(NamedTuple):
     parts: Parts
 
 
+class Located(NamedTuple):
+    """A keyframe, and the cells that its pixels lie in.
+
+    Attributes:
+        keyframe: The keyframe.
+        marked: Its pixels above the floor that show things `[h w]`; none where no floor is known.
+        keys: Key of the cell that each of these pixels lies in `[n]`.
+    """
+
+    keyframe: Shown
+    marked: Bool[np.ndarray, "h w"]
+    keys: Int[np.ndarray, " n"]
+
+    def pixels(self, thing: Thing) -> Bool[np.ndarray, "h w"]:
+        """The pixels that show an object: pixels in its cells, or with its number.
+
+        Args:
+            thing: The object.
+        """
+        view, parts = self.keyframe
+        if thing.is_numbered:
+            numbered = parts.are_numbered & (parts.labels == thing.number)
+            return np.asarray(view.segmented, bool) & numbered
+        found = self.marked.copy()
+        found[found] = np.isin(self.keys, thing.keys)
+        return found
+
+
+def located(keyframe: Shown, level: Level | None) -> Located:
+    """Find the cells of all pixels of a keyframe, for any number of objects.
+
+    Args:
+        keyframe: The keyframe.
+        level: The level frame; None before a floor was seen.
+    """
+    view = keyframe.view
+    marked = np.array(view.segmented, bool)
+    if level is None:
+        return Located(keyframe, np.zeros_like(marked), np.zeros(0, int))
+    points = world_points(view)[marked] @ level.T_level_world[:3, :3].T
+    points = points + level.T_level_world[:3, 3]
+    kept = above_floor(points, np.asarray(view.depth, np.float64)[marked], level)
+    marked[marked] = kept
+    return Located(keyframe, marked, keys_of(np.floor(points[kept] / CELL).astype(int)))
+
+
 class Look(NamedTuple):
     """The objects that are visible in a scene once a keyframe is added.
 
@@ -50,7 +96,7 @@ class Look(NamedTuple):
         tracks: The tracked objects.
     """
 
-    new: Shown
+    new: Located
     level: Level | None
     tracks: Tracks
 
@@ -61,30 +107,7 @@ class Look(NamedTuple):
             number: Number of the object; no object has the number 0.
         """
         thing = next((one for one in self.tracks.things if one.number == number), None)
-        if thing is None:
-            return np.zeros(np.shape(self.new.view.depth), bool)
-        return self.pixels_in(thing, self.new)
-
-    def pixels_in(self, thing: Thing, keyframe: Shown) -> Bool[np.ndarray, "h w"]:
-        """The pixels of a keyframe that show an object: pixels in its cells, or with its number.
-
-        Args:
-            thing: The object.
-            keyframe: The keyframe.
-        """
-        view = keyframe.view
-        found = np.array(view.segmented, bool)
-        if self.level is None:
-            return np.zeros_like(found)
-        if thing.is_numbered:
-            return found & keyframe.parts.are_numbered & (keyframe.parts.labels == thing.number)
-        points = world_points(view)[found]
-        R, t = self.level.T_level_world[:3, :3], self.level.T_level_world[:3, 3]
-        points = points @ R.T + t
-        z = np.asarray(view.depth, np.float64)[found]
-        own = np.isin(keys_of(np.floor(points / CELL).astype(int)), thing.keys)
-        found[found] = own & above_floor(points, z, self.level)
-        return found
+        return np.zeros_like(self.new.marked) if thing is None else self.new.pixels(thing)
 
 
 def look_around(
@@ -110,7 +133,7 @@ def look_around(
     level = level or _level(views[-1])
     if level is not None:
         tracks = _associated(views, level, tracks)
-    return Look(views[-1], level, tracks)
+    return Look(located(views[-1], level), level, tracks)
 
 
 def scene_parts(prepared: PreparedFrame) -> Parts:
