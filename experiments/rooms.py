@@ -151,7 +151,7 @@ def _free_place(
         ]  # fmt: skip
         if min(apart, default=1.0) > 0.15:
             break
-    T = trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * np.pi), [0, 1, 0])
+    T = np.asarray(trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * np.pi), [0, 1, 0]))
     T[:3, 3] = x, mesh.extents[1] / 2, z
     return T
 
