@@ -30,6 +30,7 @@ from jaxtyping import Array, Float
 from jaxshape.model.chunks import in_chunks, sum_chunks
 from jaxshape.model.tiles import (
     TILE,
+    adjoint,
     downsample_tiles,
     gradient_of_tiles,
     transform_kernel,
@@ -75,14 +76,18 @@ class PreparedKernel(NamedTuple):
 
 
 def prepare_kernel(kernel: Float[Array, "5 5 5 fine coarse"], side: int) -> PreparedKernel:
-    """Make a kernel ready for coarse grids of `side` voxels along each axis.
-
-    Tiles compute in float32. On hardware with bfloat16 matrix units, products of gathered
-    neighbours in bfloat16 are faster; elsewhere they take twice as long.
-    """
-    pays = kernel.dtype == jnp.float32 or not multiplies_bfloat16()
-    tiled = pays and kernel.shape[-2] > 1 and side >= TILE
+    """Make a kernel ready for coarse grids of `side` voxels along each axis."""
+    tiled = tiles_pay(kernel.dtype) and kernel.shape[-2] > 1 and side >= TILE
     return PreparedKernel(kernel, transform_kernel(kernel) if tiled else None)
+
+
+def tiles_pay(dtype: Any) -> bool:
+    """Whether fast convolution of tiles, which computes in float32, is faster for this type.
+
+    On hardware with bfloat16 matrix units, products of gathered neighbours in bfloat16 are faster;
+    elsewhere they take twice as long.
+    """
+    return dtype == jnp.float32 or not multiplies_bfloat16()
 
 
 def multiplies_bfloat16() -> bool:
@@ -178,7 +183,7 @@ def _kernel_gradient_cpu(fine, coarse):
     if not _tiled(coarse.shape, shape):
         return sum_chunks(_gradient_of_taps, size, fine, coarse).reshape(shape)
     total = sum_chunks(gradient_of_tiles, size, fine, coarse)
-    return jax.linear_transpose(transform_kernel, jnp.zeros(shape, jnp.float32))(total)[0]
+    return adjoint(transform_kernel, shape, total)
 
 
 def _tiled(coarse_shape, kernel_shape) -> bool:

@@ -20,10 +20,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxshape.model.chunks import in_chunks, sum_chunks
-from jaxshape.model.convolution import matmul, multiplies_bfloat16
+from jaxshape.model.convolution import matmul, tiles_pay
 from jaxshape.model.tiles import (
     POINTS,
     TILE,
+    adjoint,
     convolve_tiles,
     gradient_of_stencil,
     transform_stencil,
@@ -93,7 +94,7 @@ def _gradient_products(grid, cotangent, shape):
     if _tiled(grid):
         size = _tiles_in_cache(grid, GRADIENT_BYTES)
         total = sum_chunks(gradient_of_stencil, size, grid, cotangent)
-        return jax.linear_transpose(transform_stencil, jnp.zeros(shape, jnp.float32))(total)[0]
+        return adjoint(transform_stencil, shape, total)
 
     def of_some(grid, cotangent):
         rows = _transposed(cotangent)
@@ -106,8 +107,7 @@ def _gradient_products(grid, cotangent, shape):
 
 def _tiled(grid) -> bool:
     """Whether fast convolution pays off."""
-    pays = grid.dtype == jnp.float32 or not multiplies_bfloat16()
-    return pays and min(grid.shape[1:3]) >= TILE
+    return tiles_pay(grid.dtype) and min(grid.shape[1:3]) >= TILE
 
 
 def _tiles_in_cache(grid, size: int) -> int:

@@ -14,7 +14,7 @@ Rounding errors grow tenfold, to 1e-5 of the largest value in float32. It always
 float32: bfloat16 would leave at most two correct digits.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 
 import jax
@@ -78,9 +78,8 @@ def gradient_of_stencil(
     grid: Float[Array, "b x y z c"], out: Float[Array, "b x y z out"]
 ) -> Float[Array, "36 3*c out"]:
     """Gradient in the transformed kernel: the adjoint of `convolve_tiles` in its matrices."""
-    matrices = jnp.zeros((POINTS**2, 3 * grid.shape[-1], out.shape[-1]), jnp.float32)
-    convolve = lambda matrices: convolve_tiles(grid, matrices)  # noqa: E731
-    return jax.linear_transpose(convolve, matrices)(out.astype(jnp.float32))[0]
+    shape = (POINTS**2, 3 * grid.shape[-1], out.shape[-1])
+    return adjoint(lambda matrices: convolve_tiles(grid, matrices), shape, out)
 
 
 # ------------------------------------------------------------------ the size is doubled
@@ -125,6 +124,11 @@ def upsample_tiles(
 # ------------------------------------------------------------------ what both share
 
 
+def adjoint(linear: Callable[[Array], Array], shape: tuple[int, ...], out: Array) -> Array:
+    """The adjoint of a linear function of an array of this shape, applied to `out`; float32."""
+    return jax.linear_transpose(linear, jnp.zeros(shape, jnp.float32))(out.astype(jnp.float32))[0]
+
+
 def _products(
     grid: Float[Array, "b x y z c"], matrices: Float[Array, "36 3*c columns"]
 ) -> Float[Array, "4 4 b _ _ z columns"]:
@@ -155,9 +159,8 @@ def downsample_tiles(
 ) -> Float[Array, "b x//2 y//2 z//2 {matrices.shape[-2]//3}"]:
     """Convolve with a transformed kernel: the adjoint of `upsample_tiles` in its grid."""
     b, *sizes, _ = fine.shape
-    coarse = jnp.zeros((b, *[n // 2 for n in sizes], matrices.shape[1] // 3), jnp.float32)
-    up = lambda coarse: upsample_tiles(coarse, matrices)  # noqa: E731
-    return jax.linear_transpose(up, coarse)(fine.astype(jnp.float32))[0]
+    shape = (b, *[n // 2 for n in sizes], matrices.shape[1] // 3)
+    return adjoint(lambda coarse: upsample_tiles(coarse, matrices), shape, fine)
 
 
 def gradient_of_tiles(
@@ -165,6 +168,4 @@ def gradient_of_tiles(
 ) -> Float[Array, "36 3*coarse 8*fine"]:
     """Gradient in the transformed kernel: the adjoint of `upsample_tiles` in its matrices."""
     shape = (POINTS**2, 3 * coarse.shape[-1], 8 * fine.shape[-1])
-    matrices = jnp.zeros(shape, jnp.float32)
-    up = lambda matrices: upsample_tiles(coarse, matrices)  # noqa: E731
-    return jax.linear_transpose(up, matrices)(fine.astype(jnp.float32))[0]
+    return adjoint(lambda matrices: upsample_tiles(coarse, matrices), shape, fine)

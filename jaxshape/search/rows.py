@@ -76,7 +76,7 @@ def over_rows(score: Score, at_a_time: Mapping[str, int] = ROWS_AT_A_TIME) -> Ca
         (`one_network`).
     """
 
-    score = jax.jit(score, inline=True)
+    score = jax.jit(score, inline=True)  # traced once for its shapes and its values
 
     @custom_vmap
     def scored(shared, codes, own, owner):

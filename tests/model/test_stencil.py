@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxshape.model import stencil
+from jaxshape.model import convolution, stencil
 from jaxshape.model.stencil import convolve, multiply
 
 SHAPES = [(1, 4, 3, 5), (3, 8, 2, 2), (2, 5, 4, 1), (2, 3, 2, 2)]
@@ -78,7 +78,7 @@ def test_half_precision_is_close_and_keeps_its_type(form):
 def test_tiles_are_for_float32_and_for_processors_without_matrix_units(
     dtype, units, side, tiled, monkeypatch
 ):
-    monkeypatch.setattr(stencil, "multiplies_bfloat16", lambda: units)
+    monkeypatch.setattr(convolution, "multiplies_bfloat16", lambda: units)
     assert stencil._tiled(jnp.zeros((1, side, side, side, 2), dtype)) is tiled
 
 

@@ -206,23 +206,23 @@ def decide(
     found: list[dict[str, np.ndarray]] = [{} for _ in every]
     for name, prior in priors.items():
         if name not in FRONTLESS:
-            for i, own in zip(every, _scores(prior, grids, every, UPRIGHT), strict=True):
+            for i, own in zip(every, _likelihoods(prior, grids, every, UPRIGHT), strict=True):
                 found[i][name] = own
             continue
         # Nothing else depends on these classes, so that what cannot be of one is not scored.
         usual = [i for i in every if sizes is None or _is_usual(name, sizes[i])]
-        upright = _scores(prior, grids, usual, UPRIGHT)
+        upright = _likelihoods(prior, grids, usual, UPRIGHT)
         likely = [k for k, own in enumerate(upright) if own.max() >= WITHOUT_FRONT.likelihood]
-        toppled = _scores(prior, grids, [usual[k] for k in likely], TOPPLED)
+        toppled = _likelihoods(prior, grids, [usual[k] for k in likely], TOPPLED)
         for k, own in zip(likely, toppled, strict=True):
             found[usual[k]][name] = np.concatenate([upright[k], own])
     return [decided(found[i], None if sizes is None else sizes[i]) for i in every]
 
 
-def _scores(
+def _likelihoods(
     prior: ShapePrior, grids: Grids, which: Sequence[int], stances: tuple[Stance, ...]
 ) -> list[Float[np.ndarray, " stance"]]:
-    """Scores of some objects, in one call for a few numbers of objects (`predict_hidden`)."""
+    """Likelihoods of some objects, in one call for a few numbers of objects (`predict_hidden`)."""
     if not which:
         return []
     rows = jnp.array([which[min(k, len(which) - 1)] for k in range(power_of_two(len(which)))])

@@ -35,7 +35,7 @@ from jaxshape.mapping.map.state import grids_of
 from jaxshape.mapping.placement.finding import Start, first_readable, room
 from jaxshape.mapping.scene.boxing import boxed, fits, placed, turned_box
 from jaxshape.mapping.scene.classes import Decision, SceneClasses, decide, unfilled
-from jaxshape.mapping.scene.look import Located, Look, located, look_around, scene_parts, shown
+from jaxshape.mapping.scene.look import Located, Look, look_around, scene_parts, shown, with_cells
 from jaxshape.mapping.scene.things import Thing, Tracks
 from jaxshape.mapping.scene.world import Level
 from jaxshape.mapping.tracking.keyframes import Cut, PreparedFrame, as_pose, prepare
@@ -186,7 +186,7 @@ def _with_look(scene: Scene, look: Look, classes: SceneClasses) -> Scene:
     """The scene with its objects as a look around found them."""
     known = {one.thing.number: one for one in scene.objects}
     scene = scene._replace(level=look.level, tracks=look.tracks)
-    views = [located(one, look.level) for one in shown(scene.camera.state.keyframes)]
+    views = [with_cells(one, look.level) for one in shown(scene.camera.state.keyframes)]
     changed, objects = [], []
     for thing in sorted(look.tracks.things, key=lambda one: one.number):
         if thing.is_moved:

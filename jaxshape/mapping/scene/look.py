@@ -8,19 +8,18 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxshape.mapping.map.cutting import parts_in
-from jaxshape.mapping.placement.faces import Cutout, world_points
+from jaxshape.mapping.placement.faces import Cutout
 from jaxshape.mapping.placement.finding import rotation_onto_y
 from jaxshape.mapping.scene.things import Thing, Tracks, associate
 from jaxshape.mapping.scene.world import (
-    CELL,
     CHANGED,
     LEAST_CELLS,
     Level,
-    above_floor,
     cells_met,
     cells_of,
     clusters_of,
     keys_of,
+    located,
 )
 from jaxshape.mapping.segmentation.parts import Parts
 from jaxshape.mapping.tracking.keyframes import Keyframe, PreparedFrame
@@ -69,22 +68,17 @@ class Located(NamedTuple):
         return found
 
 
-def located(keyframe: Shown, level: Level | None) -> Located:
+def with_cells(keyframe: Shown, level: Level | None) -> Located:
     """Find the cells of all pixels of a keyframe, for any number of objects.
 
     Args:
         keyframe: The keyframe.
         level: The level frame; None before a floor was seen.
     """
-    view = keyframe.view
-    marked = np.array(view.segmented, bool)
     if level is None:
-        return Located(keyframe, np.zeros_like(marked), np.zeros(0, int))
-    points = world_points(view)[marked] @ level.T_level_world[:3, :3].T
-    points = points + level.T_level_world[:3, 3]
-    kept = above_floor(points, np.asarray(view.depth, np.float64)[marked], level)
-    marked[marked] = kept
-    return Located(keyframe, marked, keys_of(np.floor(points[kept] / CELL).astype(int)))
+        return Located(keyframe, np.zeros(np.shape(keyframe.view.depth), bool), np.zeros(0, int))
+    marked, index = located(keyframe.view, level)
+    return Located(keyframe, marked, keys_of(index))
 
 
 class Look(NamedTuple):
@@ -133,7 +127,7 @@ def look_around(
     level = level or _level(views[-1])
     if level is not None:
         tracks = _associated(views, level, tracks)
-    return Look(located(views[-1], level), level, tracks)
+    return Look(with_cells(views[-1], level), level, tracks)
 
 
 def scene_parts(prepared: PreparedFrame) -> Parts:

@@ -142,12 +142,23 @@ def cells_met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
     Returns:
         Indices of the cells `[n 3]`.
     """
-    marked = np.asarray(view.segmented)
+    return np.unique(located(view, level)[1], axis=0)
+
+
+def located(view: Cutout, level: Level) -> tuple[Bool[np.ndarray, "h w"], Int[np.ndarray, "n 3"]]:
+    """The marked pixels of a view above the floor, and the cell that each of them lies in.
+
+    Args:
+        view: The view, with the pixels that count.
+        level: The level frame.
+    """
+    marked = np.array(view.segmented, bool)
     points, z = world_points(view)[marked], np.asarray(view.depth, np.float64)[marked]
     R, t = level.T_level_world[:3, :3], level.T_level_world[:3, 3]
     points = points @ R.T + t
     kept = above_floor(points, z, level)
-    return np.unique(np.floor(points[kept] / CELL).astype(int), axis=0)
+    marked[marked] = kept
+    return marked, np.floor(points[kept] / CELL).astype(int)
 
 
 def above_floor(
