@@ -3,38 +3,21 @@
 Against the same network in PyTorch, in its fastest variant.
 """
 
-from collections.abc import Callable
 from functools import partial
-from itertools import product
-from typing import Any
 
 import jax
 import numpy as np
 
 import jaxshape as js
 from benchmarks import problems
-from benchmarks.harness import (
-    Metric,
-    alternate,
-    compiled,
-    difference,
-    fastest,
-    optional,
-    speedup,
-)
+from benchmarks.decode import LIMITS, TARGETS, variants
+from benchmarks.harness import LAYOUTS, Metric, against, compiled, optional
 from benchmarks.problems import PRECISIONS, Problem
 from jaxshape.geometry.grids import Grids
-from jaxshape.model.completion import evidence_of
 from jaxshape.model.config import Precision
 from jaxshape.model.shapes import decode_prepared, pick
 
 OBJECTS, POPULATIONS = (1, 16), (17, 64)
-LAYOUTS = {"contiguous": False, "channels last": True}
-TARGETS = {"float32": 1.3, "bfloat16": 1.0}
-"""Times faster than PyTorch in completing and in scoring codes."""
-
-LIMITS = {"float32": 2e-5, "bfloat16": 1e-2}
-"""Differences of the objective, in nats per voxel, that rounding explains."""
 
 
 def run(quick: bool) -> list[Metric]:
@@ -59,18 +42,19 @@ def _complete(prior: js.ShapePrior, problem: Problem, budget: float) -> list[Met
     rivals = {}
     if torch := optional("pytorch_completion"):
         network = torch.from_jaxshape(prior.params)
-        seen = _channels_first(grids)
+        seen = problems.channels_first(grids)
         rivals = {
             name: partial(torch.completer(network, channels_last=last), seen)
             for name, last in LAYOUTS.items()
         }
-    return _against(
+    return against(
         f"completion/complete/{len(problem.occupied)}",
         partial(ours, prior, grids),
         compile_seconds,
         rivals,
         budget,
         target=TARGETS["float32"],
+        unit="",
         limit=1e-3,  # of logits
     )
 
@@ -90,64 +74,18 @@ def _score(
     rivals, exact = {}, None
     if torch := optional("pytorch_completion"):
         network = torch.from_jaxshape(prior.params)
-        scorer = partial(torch.scorer, network, _channels_first(grids)[0], *target)
+        scorer = partial(torch.scorer, network, problems.channels_first(grids)[0], *target)
         host = np.array(codes)
-        kinds = {"float32": ("no",), "bfloat16": ("autocast", "cast")}[precision]
-        rivals = {
-            f"{layout}, {size or 'all'} at a time" + (f", {kind}" if kind != "no" else ""): partial(
-                scorer(channels_last=LAYOUTS[layout], bfloat16=kind, at_a_time=size), host
-            )
-            for layout, kind, size in product(LAYOUTS, kinds, (None, 8))
-        }
+        rivals = {name: partial(one, host) for name, one in variants(scorer, precision).items()}
         exact = scorer()(host)
-    return _against(
+    return against(
         f"completion/{precision}/{population}",
         partial(ours, *arguments),
         compile_seconds,
         rivals,
         budget,
         target=TARGETS[precision],
+        unit="nats/voxel",
         limit=LIMITS[precision],
         exact=exact,
     )
-
-
-def _channels_first(grids: Grids) -> np.ndarray:
-    """The four channels of evidence that the network sees, as PyTorch orders them."""
-    return np.moveaxis(np.array(jax.jit(evidence_of)(grids)), -1, 1).copy()
-
-
-def _against(
-    name: str,
-    ours: Callable[[], Any],
-    compile_seconds: float,
-    rivals: dict[str, Callable[[], Any]],
-    budget: float,
-    *,
-    target: float,
-    limit: float | None = None,
-    exact: Any = None,
-) -> list[Metric]:
-    """Times of ours and of the fastest rival, in turns, and the difference of their outputs."""
-    functions = {"jaxshape": ours}
-    chosen = fastest(rivals) if rivals else ""
-    if rivals:
-        functions["pytorch"] = rivals[chosen]
-    seconds = alternate(functions, budget=budget)
-    metrics = [
-        Metric(f"{name}/compile", compile_seconds, "s"),
-        Metric(f"{name}/jaxshape", 1e3 * np.median(seconds["jaxshape"]), "ms"),
-    ]
-    if rivals:
-        metrics += [
-            Metric(f"{name}/pytorch", 1e3 * np.median(seconds["pytorch"]), "ms", note=chosen),
-            Metric(f"{name}/speedup", speedup(seconds, "jaxshape", "pytorch"), "x", "higher",
-                   target=target),
-        ]  # fmt: skip
-    if rivals and limit is not None:
-        exact = rivals[chosen]() if exact is None else exact
-        metrics.append(
-            Metric(f"{name}/difference", difference(ours(), exact), "", "lower", limit=limit,
-                   note="largest, from PyTorch")
-        )  # fmt: skip
-    return metrics

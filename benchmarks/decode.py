@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import problems
-from benchmarks.harness import Metric, alternate, compiled, difference, fastest, optional, speedup
+from benchmarks.harness import LAYOUTS, Metric, against, alternate, compiled, optional
 from benchmarks.problems import PRECISIONS, Problem
 from jaxshape.model.autoencoder import architecture_of
 from jaxshape.model.config import Architecture, Precision
@@ -47,52 +47,34 @@ def _compare(
     prepare = partial(prior.model.prepare, grids=None, precision=precision)
     arguments = prior.model, jax.jit(prepare)(prior.params), codes, target
     ours, compile_seconds = compiled(problems.score, *arguments)
-    functions = {"jaxshape": lambda: ours(*arguments)}
-    variants = torch_scores(problem, precision)
-    if variants:
-        host = np.array(codes)
-        timed = {name: partial(score, host) for name, score in variants.items()}
-        chosen = fastest(timed)
-        functions["pytorch"] = timed[chosen]
-    seconds = alternate(functions, budget=budget)
-
-    name = f"decode/{precision}/{population}"
-    median = float(np.median(seconds["jaxshape"]))
-    times_limit = median * rate / (population * useful_flops(architecture_of(prior.params)))
-    metrics = [
-        Metric(f"{name}/compile", compile_seconds, "s"),
-        Metric(f"{name}/jaxshape", 1e3 * median, "ms"),
-        Metric(
-            f"{name}/times_limit",
-            times_limit,
-            "x",
-            "lower",
-            tolerance=1.5,  # the two rates are measured one after the other, not in turns
-            target=2.0 if precision == "float32" and population < 256 else None,
-            note="time over that of the useful products at the best matrix rate",
-        ),
-    ]
-    if variants:
+    scores, host = torch_scores(problem, precision), np.array(codes)
+    exact = None
+    if scores:
         exact = torch_scores(problem, "float32")["contiguous, all at a time"](host)
-        metrics += [
-            Metric(f"{name}/pytorch", 1e3 * np.median(seconds["pytorch"]), "ms", note=chosen),
-            Metric(
-                f"{name}/speedup",
-                speedup(seconds, "jaxshape", "pytorch"),
-                "x",
-                "higher",
-                target=TARGETS[precision] if population < 256 else None,
-            ),
-            Metric(
-                f"{name}/difference",
-                difference(ours(*arguments), exact),
-                "nats/voxel",
-                "lower",
-                limit=LIMITS[precision],
-                note="largest, from PyTorch in float32",
-            ),
-        ]
-    return metrics
+    name = f"decode/{precision}/{population}"
+    metrics = against(
+        name,
+        partial(ours, *arguments),
+        compile_seconds,
+        {variant: partial(score, host) for variant, score in scores.items()},
+        budget,
+        target=TARGETS[precision] if population < 256 else None,
+        unit="nats/voxel",
+        limit=LIMITS[precision],
+        exact=exact,
+    )
+    seconds = next(one.value for one in metrics if one.name == f"{name}/jaxshape") / 1e3
+    useful = population * useful_flops(architecture_of(prior.params))
+    times_limit = Metric(
+        f"{name}/times_limit",
+        seconds * rate / useful,
+        "x",
+        "lower",
+        tolerance=1.5,  # the two rates are measured one after the other, not in turns
+        target=2.0 if precision == "float32" and population < 256 else None,
+        note="time over that of the useful products at the best matrix rate",
+    )
+    return [*metrics, times_limit]
 
 
 def torch_scores(problem: Problem, precision: Precision) -> dict[str, Callable]:
@@ -102,15 +84,17 @@ def torch_scores(problem: Problem, precision: Precision) -> dict[str, Callable]:
         return {}
     decoder = pytorch.from_jaxshape(problem.prior.params).decoder
     target = [x[0] for x in problem.target]
+    return variants(partial(pytorch.scorer, decoder, *target), precision)
+
+
+def variants(scorer: Callable[..., Callable], precision: Precision) -> dict[str, Callable]:
+    """Every way in which PyTorch may score codes: layouts, arithmetic, and codes at a time."""
     arithmetic = {"float32": ("no",), "bfloat16": ("autocast", "cast")}[precision]
-    layouts = {"contiguous": False, "channels last": True}
     return {
-        f"{layout}, {size or 'all'} at a time" + (f", {how}" if how != "no" else ""): (
-            pytorch.scorer(
-                decoder, *target, channels_last=layouts[layout], bfloat16=how, at_a_time=size
-            )
+        f"{layout}, {size or 'all'} at a time" + (f", {how}" if how != "no" else ""): scorer(
+            channels_last=last, bfloat16=how, at_a_time=size
         )
-        for layout, how, size in product(layouts, arithmetic, (None, 8))
+        for (layout, last), how, size in product(LAYOUTS.items(), arithmetic, (None, 8))
     }
 
 

@@ -19,6 +19,9 @@ from jaxtyping import Float
 from jaxshape.bench.machine import describe_machine
 
 ROOT = Path(__file__).parents[1]
+LAYOUTS = {"contiguous": False, "channels last": True}
+"""PyTorch's layouts of grids, and whether channels are last."""
+
 BURST = 0.03
 """Seconds that a function is called again and again before it is another one's turn."""
 
@@ -106,6 +109,54 @@ def fastest(functions: dict[str, Callable[[], Any]]) -> str:
     """Which of several variants of a rival is worth the comparison."""
     seconds = alternate(functions, budget=0.3, at_least=1)
     return min(seconds, key=lambda name: np.median(seconds[name]))
+
+
+def against(
+    name: str,
+    ours: Callable[[], Any],
+    compile_seconds: float,
+    rivals: dict[str, Callable[[], Any]],
+    budget: float,
+    *,
+    target: float | None,
+    unit: str,
+    limit: float,
+    exact: Any = None,
+) -> list[Metric]:
+    """Times of ours and of PyTorch's fastest variant, in turns, and the difference of the outputs.
+
+    Args:
+        name: Name of the metrics.
+        ours: Our function.
+        compile_seconds: How long it took to compile.
+        rivals: PyTorch's variants; none where PyTorch is missing.
+        budget: Seconds of measuring.
+        target: How many times faster ours is to be.
+        unit: Unit of the outputs.
+        limit: Largest difference of the outputs that rounding explains.
+        exact: PyTorch's output in float32; None for that of the fastest variant.
+    """
+    functions, chosen = {"jaxshape": ours}, ""
+    if rivals:
+        chosen = fastest(rivals)
+        functions["pytorch"] = rivals[chosen]
+    seconds = alternate(functions, budget=budget)
+    metrics = [
+        Metric(f"{name}/compile", compile_seconds, "s"),
+        Metric(f"{name}/jaxshape", 1e3 * float(np.median(seconds["jaxshape"])), "ms"),
+    ]
+    if rivals:
+        exact = rivals[chosen]() if exact is None else exact
+        times = 1e3 * float(np.median(seconds["pytorch"]))
+        ratio = speedup(seconds, "jaxshape", "pytorch")
+        note = "largest, from PyTorch in float32"
+        metrics += [
+            Metric(f"{name}/pytorch", times, "ms", note=chosen),
+            Metric(f"{name}/speedup", ratio, "x", "higher", target=target),
+            Metric(f"{name}/difference", difference(ours(), exact), unit, "lower",
+                   limit=limit, note=note),
+        ]  # fmt: skip
+    return metrics
 
 
 def difference(a: Any, b: Any) -> float:

@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 import jaxshape as js
 from jaxshape.data.capture import camera_distance
+from jaxshape.geometry.grids import Grids
+from jaxshape.model.completion import evidence_of
 from jaxshape.model.config import Precision
 from jaxshape.model.shapes import ShapePrior
 from jaxshape.search.objective import ObjectTerms, evaluation
@@ -68,6 +70,11 @@ def nearby_codes(problem: Problem, count: int, seed: int = 0) -> Float[Array, "n
     """Candidates about the first object's code, as a search would draw them."""
     z = jax.random.normal(jax.random.key(seed), (count, problem.code.shape[-1]))
     return problem.code[0] + 0.1 * z @ jnp.linalg.cholesky(problem.prior.code_covariance).T
+
+
+def channels_first(grids: Grids) -> Float[np.ndarray, "b 4 x y z"]:
+    """The evidence that the conditional network sees, with its channels as PyTorch orders them."""
+    return np.moveaxis(np.array(jax.jit(evidence_of)(grids)), -1, 1).copy()
 
 
 # ------------------------------------------------------------------ our side of the comparisons

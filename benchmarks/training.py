@@ -19,6 +19,7 @@ from jax.sharding import PartitionSpec as P
 import jaxshape as js
 from benchmarks import problems
 from benchmarks.harness import (
+    LAYOUTS,
     Metric,
     alternate,
     compiled,
@@ -29,7 +30,6 @@ from benchmarks.harness import (
     speedup,
 )
 from benchmarks.problems import PRECISIONS
-from jaxshape.model.completion import evidence_of
 from jaxshape.model.config import PRESETS, Precision
 from jaxshape.model.families import Batch
 from jaxshape.model.training import _parallel_step, initial_state
@@ -40,7 +40,6 @@ BATCH = 32
 CASES = {"autoencoder": ("chair-autoencoder", "autoencoder"), "completion": ("chair", "default")}
 """Weights and settings of each network."""
 
-LAYOUTS = {"contiguous": False, "channels last": True}
 LIMITS = {"float32": 1e-5, "bfloat16": 3e-3}
 """Differences of the loss, in nats per voxel, that rounding explains."""
 
@@ -113,7 +112,7 @@ def _rivals(
     if network == "autoencoder":
         torch, arguments = optional("pytorch"), (batch.occupied, batch.surface)
     else:
-        seen = np.moveaxis(np.array(evidence_of(batch.grids)), -1, 1).copy()
+        seen = problems.channels_first(batch.grids)
         noise = np.random.default_rng(0).normal(size=(BATCH, prior.code_size))
         torch = optional("pytorch_completion")
         arguments = seen, batch.surface, noise

@@ -144,9 +144,7 @@ def scorer(
 
     The targets of one object, or of as many as the codes' leading axis has.
     """
-    decoder = fold(decoder).to(DEVICE)
-    if channels_last:
-        decoder = decoder.to(memory_format=torch.channels_last_3d)
+    decoder = laid_out(fold(decoder), channels_last)
     if bfloat16 == "cast":
         decoder = decoder.to(torch.bfloat16)
     dtype = next(decoder.parameters()).dtype
@@ -176,25 +174,41 @@ def trainer(
     learning_rate: float = 1e-3,
 ) -> Callable[[np.ndarray, np.ndarray], float]:
     """One step of Adam on a batch of measured and complete grids; gives the loss."""
-    network = copy.deepcopy(network).to(DEVICE).train()
-    if channels_last:
-        network = network.to(memory_format=torch.channels_last_3d)
-    adam = torch.optim.Adam(network.parameters(), learning_rate, (0.9, 0.999), fused=True)
+    network = laid_out(network, channels_last).train()
+    adam = adam_for(network, learning_rate)
 
     def step(measured: np.ndarray, surface: np.ndarray) -> torch.Tensor:
         grid, truth = (torch.as_tensor(x, device=DEVICE).float() for x in (measured, surface))
         with torch.autocast(DEVICE, torch.bfloat16, enabled=bfloat16):
             logits = network(grid)
             loss = F.binary_cross_entropy_with_logits(logits.float(), truth)
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        with torch.no_grad():  # the mean IoU that jaxshape's step reports too
-            done, true, axes = logits > 0, truth > 0, (1, 2, 3)
-            (done & true).sum(axes).div((done | true).sum(axes)).mean()
-        return loss.item()
+        return descend(adam, loss, logits, truth)
 
     return step
+
+
+def laid_out(network: nn.Module, channels_last: bool) -> Any:
+    """A copy of a network on the device, in either layout."""
+    network = copy.deepcopy(network).to(DEVICE)
+    return network.to(memory_format=torch.channels_last_3d) if channels_last else network
+
+
+def adam_for(network: nn.Module, learning_rate: float) -> torch.optim.Adam:
+    """Adam with the settings of jaxshape."""
+    return torch.optim.Adam(network.parameters(), learning_rate, (0.9, 0.999), fused=True)
+
+
+def descend(
+    adam: torch.optim.Adam, loss: torch.Tensor, logits: torch.Tensor, truth: torch.Tensor
+) -> float:
+    """Move down the gradient of the loss; gives the loss."""
+    adam.zero_grad()
+    loss.backward()
+    adam.step()
+    with torch.no_grad():  # the mean IoU that jaxshape's step reports too
+        done, true, axes = logits > 0, truth > 0, (1, 2, 3)
+        (done & true).sum(axes).div((done | true).sum(axes)).mean()
+    return loss.item()
 
 
 def product(a: np.ndarray, b: np.ndarray, precision: str) -> Callable[[], torch.Tensor]:

@@ -5,7 +5,6 @@ merged by convolutions of stride 2 and split by transposed ones; `channels_last`
 the variants worth timing. It starts from the four channels of evidence that the network sees.
 """
 
-import copy
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -14,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from benchmarks.rivals.pytorch import DEVICE, cross_entropy
+from benchmarks.rivals.pytorch import DEVICE, adam_for, cross_entropy, descend, laid_out
 
 Bfloat16 = Literal["no", "autocast", "cast"]
 
@@ -205,16 +204,11 @@ def from_jaxshape(params: Any) -> Completion:
     return network.eval()
 
 
-def _laid_out(network: nn.Module, channels_last: bool) -> nn.Module:
-    network = copy.deepcopy(network).to(DEVICE)
-    return network.to(memory_format=torch.channels_last_3d) if channels_last else network
-
-
 def completer(
     network: Completion, *, channels_last: bool = False, bfloat16: bool = False
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Evidence of objects `[b 4 x y z]` to the logits of their first codes."""
-    network = _laid_out(network, channels_last)  # type: ignore[assignment]
+    network = laid_out(network, channels_last)
     code = network.decoder.code.in_features
 
     @torch.inference_mode()
@@ -239,7 +233,7 @@ def scorer(
     at_a_time: int | None = None,
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Codes `[n d]` of one object to objectives (decode, then Eq. 7), some together or all."""
-    decoder: Any = _laid_out(network.decoder, channels_last)
+    decoder = laid_out(network.decoder, channels_last)
     with torch.inference_mode():
         sides = _sides(network.measured.to(DEVICE), torch.tensor(evidence, device=DEVICE)[None])
     dtype = torch.bfloat16 if bfloat16 == "cast" else torch.float32
@@ -277,8 +271,8 @@ def trainer(
     learning_rate: float = 1e-3,
 ) -> Callable[..., float]:
     """One step of Adam on the evidence bound; gives the loss."""
-    network = _laid_out(network, channels_last).train()  # type: ignore[assignment]
-    adam = torch.optim.Adam(network.parameters(), learning_rate, (0.9, 0.999), fused=True)
+    network = laid_out(network, channels_last).train()
+    adam = adam_for(network, learning_rate)
 
     def step(evidence, surface, noise) -> float:
         tensors = [torch.as_tensor(x, device=DEVICE) for x in (evidence, surface, noise)]
@@ -287,12 +281,6 @@ def trainer(
             logits, nats = network(seen, truth, normal)
             loss = F.binary_cross_entropy_with_logits(logits.float(), truth)
             loss = loss + nats / truth.numel()
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        with torch.no_grad():  # the mean IoU that jaxshape's step reports too
-            done, true, axes = logits > 0, truth > 0, (1, 2, 3)
-            (done & true).sum(axes).div((done | true).sum(axes)).mean()
-        return loss.item()
+        return descend(adam, loss, logits, truth)
 
     return step

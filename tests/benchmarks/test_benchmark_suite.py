@@ -14,10 +14,10 @@ import tyro
 from rich.console import Console
 
 import jaxshape as js
-from benchmarks import NAMES, __main__, decode, fusion, harness
+from benchmarks import NAMES, __main__, decode, fusion, harness, problems
 from benchmarks.harness import Metric
 from benchmarks.rivals import numpy_fusion
-from jaxshape.model.completion import COMPLETION, evidence_of, initialize
+from jaxshape.model.completion import COMPLETION, initialize
 from jaxshape.model.config import Architecture, Completion, TrainConfig
 from jaxshape.model.families import COMPLETIONS, Batch
 
@@ -151,7 +151,7 @@ def test_the_conditional_network_in_pytorch_is_ours():
     rng = np.random.default_rng(0)
     occupied, occluded = rng.random((2, 2, 32, 32, 32), np.float32)
     grids, surface = js.Grids(occupied, occluded), rng.random(occupied.shape) < 0.1
-    seen = np.moveaxis(np.array(evidence_of(grids)), -1, 1).copy()
+    seen = problems.channels_first(grids)
     network = rival.from_jaxshape(params)
 
     prepared = jax.jit(COMPLETION.prepare, static_argnums=2)(params, grids, "float32")
