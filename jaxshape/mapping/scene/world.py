@@ -110,7 +110,7 @@ def cells_of(views: Sequence[Cutout], level: Level) -> Cells:
         level: The level frame.
     """
     met = [cells_met(view, level) for view in views]
-    index = np.unique(np.concatenate([np.zeros((0, 3), int), *met]), axis=0)
+    index = _each_once(np.concatenate([np.zeros((0, 3), int), *met]))
     T_world_level = np.linalg.inv(level.T_level_world)
     centers = (index + 0.5) * CELL @ T_world_level[:3, :3].T + T_world_level[:3, 3]
     key = keys_of(index)
@@ -125,11 +125,15 @@ def _beside(index: Int[np.ndarray, "n 3"], met: Int[np.ndarray, "m 3"]) -> Bool[
     """Cells that are among other cells or touch them."""
     if not len(met):
         return np.zeros(len(index), bool)
-    low = index.min(axis=0)
-    grid = np.zeros(index.max(axis=0) - low + 1, bool)
-    grid[tuple((met - low).T)] = True
-    grown = ndimage.maximum_filter(grid, 3, mode="constant")  # axis by axis: faster than a dilation
-    return np.asarray(grown[tuple((index - low).T)], bool)
+    low = met.min(axis=0) - 1
+    filled = np.zeros(met.max(axis=0) - low + 2, bool)
+    filled[tuple((met - low).T)] = True
+    for axis in range(3):  # axis by axis: much faster than a dilation
+        before, after = (np.roll(filled, step, axis) for step in (1, -1))  # the rim is empty
+        filled = filled | before | after
+    inside = ((index >= low) & (index < low + filled.shape)).all(axis=1)
+    inside[inside] = filled[tuple((index[inside] - low).T)]
+    return inside
 
 
 def cells_met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
@@ -142,7 +146,12 @@ def cells_met(view: Cutout, level: Level) -> Int[np.ndarray, "n 3"]:
     Returns:
         Indices of the cells `[n 3]`.
     """
-    return np.unique(located(view, level)[1], axis=0)
+    return _each_once(located(view, level)[1])
+
+
+def _each_once(index: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 3"]:
+    """Cells without repetitions, in the order of their keys."""
+    return index[np.unique(keys_of(index), return_index=True)[1]]
 
 
 def located(view: Cutout, level: Level) -> tuple[Bool[np.ndarray, "h w"], Int[np.ndarray, "n 3"]]:
@@ -323,13 +332,13 @@ def _joined(parts: list[Int[np.ndarray, "_ 3"]]) -> list[Int[np.ndarray, "_ 3"]]
 
 
 def _is_fragment(part: Int[np.ndarray, "n 3"], whole: Int[np.ndarray, "m 3"]) -> bool:
-    if len(part) > FRAGMENT * len(whole):
-        return False
     gap = max(part[:, 1].min() - whole[:, 1].max(), whole[:, 1].min() - part[:, 1].max())
+    if len(part) > FRAGMENT * len(whole) or gap * CELL >= HIGHER:
+        return False
     yaw, size, middle = rectangle(whole[:, [0, 2]].astype(float))
     near = (part[:, [0, 2]] - middle) @ _axes(yaw).T
     within = (np.abs(near) < size / 2 + 1).all(axis=1).mean()
-    return bool(gap * CELL < HIGHER and within > COVERED)
+    return bool(within > COVERED)
 
 
 def _is_furniture(index: Int[np.ndarray, "n 3"]) -> bool:
@@ -363,8 +372,7 @@ def rectangle(
     """
     yaws = np.deg2rad(np.arange(0, 90, 1.5))
     axes = np.stack([_axes(yaw) for yaw in yaws])
-    along = np.einsum("kij,nj->kni", axes, points)
-    low, high = np.percentile(along, (0.5, 99.5), axis=1)
+    low, high = np.percentile(axes @ points.T, (0.5, 99.5), axis=2)
     best = int(np.argmin(np.prod(high - low + 1e-9, axis=1)))
     middle = (low[best] + high[best]) / 2 @ axes[best]
     return float(yaws[best]), high[best] - low[best], middle
