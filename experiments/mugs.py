@@ -184,7 +184,7 @@ def plot(config: Config, prior: ShapePrior, rows: int = 4) -> None:
     """Draw mugs held out of training, a row for each."""
     found = dict(survey(meshes.list_meshes(config.output), front="x", workers=1))
     held_out = hold_out([found[i] for i in sorted(found)])[1][:rows]
-    models = [cast(meshes.Model, meshes.load(source, front="x")) for source in held_out]
+    models = [cast(meshes.Model, meshes.load(one.source, front="x")) for one in held_out]
     seen = [cast(Case, observe(model, replace(SEEN, frames=(4,)))) for model in models]
     cases = jax.tree.map(lambda *x: jnp.concatenate(x), *seen)
     search = replace(SEARCH, iterations=2 if config.smoke else config.iterations)

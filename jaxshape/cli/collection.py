@@ -51,34 +51,23 @@ def look_at(sources: Sequence[Any], axes: Axes, workers: int | None = None) -> l
     return found
 
 
-def load_models(
+def usable_of(
     sources: Sequence[Any], axes: Axes, *, refuse: bool = True
 ) -> tuple[list[Any], list[Any]]:
-    """The usable meshes (`Model`) and the `Skipped` ones; `refuse` raises if none is usable."""
-    from jaxshape.data.dataset import load_object
-    from jaxshape.data.meshes import Skipped
-    from jaxshape.data.survey import doubted_size
-
-    with progress_bar("meshes") as bar:
-        task = bar.add_task("read", note="")
-        watched = bar.track(sources, task_id=task)
-        found = [
-            load_object(source, up=axes.up, front=axes.front, unit=axes.unit) for source in watched
-        ]
-    skipped = [f for f in found if isinstance(f, Skipped)]
-    models = [f for f in found if not isinstance(f, Skipped)]
+    """The usable meshes (`Surveyed`) and the `Skipped` ones; `refuse` raises if none is usable."""
+    found = look_at(sources, axes)
+    skipped = [one.skipped for one in found if one.skipped is not None]
+    usable = [one for one in found if one.skipped is None]
     report_skipped(skipped)
-    report_notes((model.name, note) for model in models for note in model.notes)
+    report_notes((one.source.name, note) for one in usable for note in one.notes)
     require(
-        bool(models) or not refuse,
+        bool(usable) or not refuse,
         f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
         f"{skipped[0].reason}. {skipped[0].detail}"
         if skipped
         else "",
     )
-    if doubt := doubted_size([float(model.mesh.scale) for model in models], axes.unit):
-        warn(doubt)
-    return models, skipped
+    return usable, skipped
 
 
 # ------------------------------------------------------------------ axes

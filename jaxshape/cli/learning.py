@@ -17,13 +17,12 @@ from jaxshape.cli.collection import (
     SAMPLE,
     check_axes,
     find_meshes,
-    load_models,
     look_at,
     turned,
 )
 from jaxshape.cli.common import console, progress_bar, report_notes, report_skipped, require
 from jaxshape.cli.options import Axes, AxesName, Machines
-from jaxshape.cli.scoring import score
+from jaxshape.cli.scoring import digests_of, score
 from jaxshape.data.config import DatasetConfig, FamilyName
 from jaxshape.files import write_json, write_text
 from jaxshape.model.config import TrainConfig
@@ -241,8 +240,8 @@ class Train:
         with console.status("calibrating probabilities"):
             return prior._replace(calibration=fit_calibration(prior, kept.grids, kept.surface))
 
-    def build(self, output: Path) -> tuple[Path, tuple[list[Any], list[Any]]]:
-        """Build a dataset of --meshes; returns its folder, and held-out and skipped models."""
+    def build(self, output: Path) -> tuple[Path, list[Any]]:
+        """Build a dataset of --meshes; returns its folder, and the held-out meshes (`Surveyed`)."""
         import jax
 
         from jaxshape.data.split import hold_out
@@ -259,7 +258,6 @@ class Train:
         training, held_out = hold_out(found)
         lying = [one.source.name for one in usable if one.lies]
         check_axes([one.source for one in usable], lying, self.axes)
-        models = load_models(held_out, self.axes)  # refuse them now, not after hours of training
         config = replace(
             OWN_MESHES,
             up=self.axes.up,
@@ -269,10 +267,10 @@ class Train:
             seed=self.config.seed,
         )
         build(output / "dataset", training, config, PROCESSORS)
-        return output / "dataset", models
+        return output / "dataset", held_out
 
     def write(self, output: Path, prior: Any, about: dict[str, Any], held_out: Any) -> None:
-        """Write the weights and cards of a finished run, and score it on the held-out models."""
+        """Write the weights and cards of a finished run, and score it on the held-out meshes."""
         from jaxshape.model.weights import load_prior, save_prior
         from jaxshape.report.card import describe
         from jaxshape.results.evaluation import EvaluateConfig
@@ -291,7 +289,9 @@ class Train:
             )
             settings = {"meshes": f"held out of {self.meshes}", "weights": str(weights)}
             prior = load_prior(weights)  # as users load it: in half precision
-            scores = score(output / "evaluation.json", prior, config, settings, *held_out)
+            objects, digests = [one.source for one in held_out], digests_of(held_out)
+            where = output / "evaluation.json"
+            scores = score(where, prior, config, settings, objects, self.axes, digests)
         write_text(output / f"{self.name}.md", describe(self.name, card, scores))
         print(f"wrote {weights} and its card, {self.name}.md")
 

@@ -1,7 +1,7 @@
 """`jaxshape evaluate` and `jaxshape plot`: the quality of results, and the course of a search."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from jaxshape.claim import Output
-from jaxshape.cli.collection import check_axes, find_meshes, load_models, turned
+from jaxshape.cli.collection import check_axes, find_meshes, turned, usable_of
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Machines, Seen, checked_numbers
 from jaxshape.data.config import FamilyName
@@ -89,27 +89,25 @@ class Evaluate:
         evaluation.by_each_method(prior, config)  # refuse unknown methods before meshes are read
         share = Share(jax.process_index(), jax.process_count())
         names = [source.name for source in sources]
-        mine = share.of(sources)
+        mine, digests, skipped = share.of(sources), {}, []
         if self.meshes:
             mine = turned(mine, self.axes, prior)
-        models, skipped = load_models(mine, self.axes, refuse=share.count == 1)
-        if self.meshes and self.family == "chair":
-            self.check(mine, models, prior)
+            usable, skipped = usable_of(mine, self.axes, refuse=share.count == 1)
+            mine, digests = [one.source for one in usable], digests_of(usable)
+            if self.family == "chair":  # refuse seats that lie on their side, and warn of others
+                lying = [one.source.name for one in usable if one.lies]
+                check_axes(mine, lying, self.axes, prior=prior, refuse=self.weights is None)
         about = {
             "meshes": str(self.meshes or f"{self.count} procedural {self.family}s"),
             **asdict(self.axes),
             "weights": str(self.weights) if self.weights else f"{packaged} (packaged)",
         }
-        score(self.output, prior, config, about, models, skipped, names, share)
+        score(self.output, prior, config, about, mine, self.axes, digests, skipped, names, share)
 
-    def check(self, sources: Sequence[Any], models: Sequence[Any], prior: Any) -> None:
-        """Refuse seats that lie on their side, and warn of seats that face another way."""
-        from jaxshape.data.meshes import lying_on_its_side
 
-        lying = [model.name for model in models if lying_on_its_side(model.mesh)]
-        usable = {model.name for model in models}
-        kept = [source for source in sources if source.name in usable]
-        check_axes(kept, lying, self.axes, prior=prior, refuse=self.weights is None)
+def digests_of(usable: Sequence[Any]) -> dict[str, str]:
+    """Digest of the files of each mesh, by its name, from a survey of usable meshes."""
+    return {one.source.name: one.digest for one in usable}
 
 
 def score(
@@ -117,20 +115,23 @@ def score(
     prior: Any,
     config: Any,
     about: dict[str, Any],
-    models: Sequence[Any],
-    skipped: Sequence[Any],
+    objects: Sequence[Any],
+    axes: Axes,
+    digests: Mapping[str, str],
+    skipped: Sequence[Any] = (),
     names: Sequence[str] | None = None,
     share: Any = None,
 ) -> dict[str, Any] | None:
-    """Score models, write the results file, print its table; returns the content of the file.
+    """Score objects, write the results file, print its table; returns the content of the file.
 
     `config` is an `EvaluateConfig`; `about` holds the origin of meshes and weights. A killed
-    evaluation resumes when it is started again with the same weights and settings. Several
-    processes each score their share of all `names`; the last to finish reads the rows of the others
-    and writes the file, and the others return None. `share` is a `Share`; None for a single
-    process.
+    evaluation resumes when it is started again with the same weights and settings; meshes whose
+    digests have changed are scored anew. Several processes each score their share of all `names`;
+    the last to finish reads the rows of the others and writes the file, and the others return None.
+    `share` is a `Share`; None for a single process.
     """
     start = time.perf_counter()
+    from jaxshape.data.dataset import LoadedWhenNeeded
     from jaxshape.data.meshes import Skipped
     from jaxshape.model.weights import fingerprint
     from jaxshape.results import evaluation
@@ -139,19 +140,20 @@ def score(
     resolved = {"noise": config.is_noisy, "fusion": config.fused_by}
     settings = asdict(config) | resolved | about
     stamp = settings | {"fingerprint": fingerprint(prior)}
-    names = [one.name for one in (*models, *skipped)] if names is None else names
+    names = [one.name for one in (*objects, *skipped)] if names is None else names
     for earlier in journals_of(output, stamp):  # drop rows of files that have changed since
-        earlier.forget({model.name: model.digest for model in models})
+        earlier.forget({one.name: digests.get(one.name, "") for one in objects})
     journal = (share or Share()).journal(output, stamp)
     scored = {name for name, row in _rows(output, stamp).items() if "skipped" not in row}
-    left = [model for model in models if model.name not in scored]
+    left = [one for one in objects if one.name not in scored]
+    models = LoadedWhenNeeded(left, up=axes.up, front=axes.front, unit=axes.unit)
     unseen = []
     if skipped:
         journal.add({one.name: {"skipped": one._asdict()} for one in skipped}, 0.0)
     with progress_bar("meshes") as bar:
-        completed = len(models) - len(left)
-        task = bar.add_task("evaluate", total=len(models), completed=completed, note="")
-        for scores in evaluation.evaluate(prior, left, config):
+        completed = len(objects) - len(left)
+        task = bar.add_task("evaluate", total=len(objects), completed=completed, note="")
+        for scores in evaluation.evaluate(prior, models, config):
             if isinstance(scores, Skipped):
                 unseen.append(scores)
                 row = {scores.name: {"skipped": scores._asdict()}}

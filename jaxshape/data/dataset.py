@@ -9,9 +9,12 @@ bits for the probability of surface and 4 for the probability of free space, in 
 `building` makes datasets; this module packs the pairs of one object and reads finished datasets.
 """
 
+import gc
 import os
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import jax
 import numpy as np
@@ -58,6 +61,33 @@ def load_object(
     if isinstance(item, MeshSource):
         return meshes.load(item, up=up, front=front, unit=unit)
     return Model(item.name, item.make(), {})
+
+
+class LoadedWhenNeeded(Sequence[Model | Skipped]):
+    """Objects of which none stays in memory: each is made or read whenever it is asked for.
+
+    The parts of a mesh refer to each other in cycles, and Python looks for unused cycles rarely
+    where JAX holds many objects. So earlier meshes are freed before others are read.
+    """
+
+    def __init__(
+        self, items: Sequence[Object], *, up: str = "y", front: str = "z", unit: UnitName = "m"
+    ):
+        self._items = items
+        self._load = partial(load_object, up=up, front=front, unit=unit)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @overload
+    def __getitem__(self, index: int) -> Model | Skipped: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Model | Skipped]: ...
+    def __getitem__(self, index: int | slice) -> Model | Skipped | list[Model | Skipped]:
+        gc.collect()
+        if isinstance(index, slice):
+            return [self._load(item) for item in self._items[index]]
+        return self._load(self._items[index])
 
 
 def object_paths(

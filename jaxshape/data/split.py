@@ -21,7 +21,7 @@ COARSE = 2
 """Number of decimals of a signature that decide the side of a mesh."""
 
 
-def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[MeshSource]]:
+def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[Surveyed]]:
     """Split meshes into training meshes and held-out ones: about every tenth, at least one.
 
     The side depends only on the shape, not on the name, the folder or the format. A mesh therefore
@@ -51,10 +51,8 @@ def hold_out(meshes: Sequence[Surveyed]) -> tuple[list[MeshSource], list[MeshSou
     chosen = sorted(marks, key=lambda group: marks[group])
     marked = sum(mark < SHARE for mark in marks.values())
     kept_out = set(chosen[: min(max(marked, 1), count - 1)])
-    held_out = [
-        mesh.source for group, mesh in zip(groups, usable, strict=True) if group in kept_out
-    ]
-    places = {(source.path, source.member) for source in held_out}
+    held_out = [mesh for group, mesh in zip(groups, usable, strict=True) if group in kept_out]
+    places = {(mesh.source.path, mesh.source.member) for mesh in held_out}
     training = [mesh.source for mesh in meshes]
     return [s for s in training if (s.path, s.member) not in places], held_out
 

@@ -33,6 +33,8 @@ class Surveyed(NamedTuple):
         signature: Numbers that identify its shape, see `signature_of`; empty if it cannot be used.
         lies: Whether it is a seat that seems to lie on its side.
         skipped: Why the mesh cannot be used; None if it can.
+        digest: Digest of the content of its files; empty if it cannot be used.
+        notes: Sentences on parts of the file that are not the object and were left out.
     """
 
     source: MeshSource
@@ -40,6 +42,8 @@ class Surveyed(NamedTuple):
     signature: tuple[float, ...]
     lies: bool
     skipped: Skipped | None
+    digest: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def survey(
@@ -86,8 +90,8 @@ def look(source: MeshSource, *, up: str, front: str, unit: UnitName) -> Surveyed
     if isinstance(model, Skipped):
         return Surveyed(source, 0.0, (), False, model)
     mesh = model.mesh
-    lies = lying_on_its_side(mesh)
-    return Surveyed(source, float(mesh.scale), signature_of(mesh), lies, None)
+    lies, size = lying_on_its_side(mesh), float(mesh.scale)
+    return Surveyed(source, size, signature_of(mesh), lies, None, model.digest, model.notes)
 
 
 def signature_of(mesh: trimesh.Trimesh) -> tuple[float, ...]:

@@ -252,6 +252,8 @@ def pick(tree: PyTree, index: Int[Array, "*n"] | int) -> PyTree:
 
 def _a_few_at_a_time(function: Callable[[Int[Array, " n"]], Any], count: int) -> Any:
     """Apply a function to all row indices, on CPU to a few rows at a time."""
+    if count <= EXAMPLES_AT_A_TIME:  # the same on every platform: traced once
+        return function(jnp.arange(count))
     chunked = partial(in_chunks, function, EXAMPLES_AT_A_TIME)
     return lax.platform_dependent(jnp.arange(count), cpu=chunked, default=function)
 

@@ -116,7 +116,7 @@ def observe(model: Model, config: EvaluateConfig, resolution: int = RESOLUTION) 
 
 
 def evaluate(
-    prior: ShapePrior, models: Sequence[Model], config: EvaluateConfig
+    prior: ShapePrior, models: Sequence[Model | Skipped], config: EvaluateConfig
 ) -> Iterator[dict[str, Any] | Skipped]:
     """Score each mesh in turn.
 
@@ -125,23 +125,25 @@ def evaluate(
 
     Args:
         prior: The shape prior.
-        models: The meshes.
+        models: The meshes, of which a batch at a time is taken (`LoadedWhenNeeded`).
         config: Settings of the evaluation.
 
     Yields:
-        The scores of each mesh, as written under `per_mesh` in the results file; a mesh without any
-        measurement is `Skipped`.
+        The scores of each mesh, as written under `per_mesh` in the results file; a mesh that cannot
+        be used, or of which nothing is measured, is `Skipped`.
     """
     run, fit = by_each_method(prior, config), jax.jit(fit_surface)
     group = max(1, OBJECTS_AT_A_TIME * jax.local_device_count() // len(config.frames))
     size = min(group, len(models)) * len(config.frames)
     for start in range(0, len(models), group):
-        observed = [
-            (model, observe(model, config, prior.resolution))
-            for model in models[start : start + group]
-        ]
-        yield from (Skipped(m.name, "nothing measured", NOTHING) for m, c in observed if c is None)
-        seen = [(model, case) for model, case in observed if case is not None]
+        seen = []
+        for model in models[start : start + group]:
+            if isinstance(model, Skipped):
+                yield model
+            elif (case := observe(model, config, prior.resolution)) is None:
+                yield Skipped(model.name, "nothing measured", NOTHING)
+            else:
+                seen.append((model, case))
         if not seen:
             continue
         keys = jnp.concatenate([case_keys(m.name, config.frames, config.seed) for m, _ in seen])

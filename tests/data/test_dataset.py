@@ -1,6 +1,8 @@
+import gc
 import json
 import os
 import shutil
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +17,7 @@ from jaxshape.data.dataset import (
     OBJECTS_PER_SHARD,
     DatasetConfig,
     DatasetError,
+    LoadedWhenNeeded,
     hash_seed,
     object_paths,
     open_dataset,
@@ -24,6 +27,7 @@ from jaxshape.data.dataset import (
     unpack_measured,
 )
 from jaxshape.data.families import procedural_objects
+from jaxshape.data.meshes import Skipped
 from jaxshape.geometry.grids import Grids
 
 CONFIG = DatasetConfig(paths=2, frames=(1, 2), cameras=("paper",))
@@ -314,3 +318,22 @@ def test_an_array_of_fewer_objects_than_its_names_is_refused(copied):
     np.save(path, np.load(path)[:-1])
     with pytest.raises(DatasetError, match="measured.npy.*its shard has"):
         open_dataset(copied)
+
+
+def test_meshes_are_read_when_they_are_needed_and_freed_afterwards(tmp_path):
+    for i in range(3):
+        trimesh.creation.box([1, 2, 1 + i]).export(tmp_path / f"box-{i}.ply")
+    files = list_meshes(tmp_path)
+    (tmp_path / "box-2.ply").unlink()
+    gc.disable()
+    try:
+        needed = LoadedWhenNeeded(files, up="y", front="z", unit="cm")
+        first, second = needed[0], needed[:2][1]
+        assert len(needed) == 3 and first.name == "box-0"
+        np.testing.assert_allclose(second.mesh.extents, [0.01, 0.02, 0.02])
+        seen = weakref.ref(second.mesh)
+        del second
+        assert seen() is not None  # its parts refer to each other
+        assert isinstance(needed[2], Skipped) and seen() is None
+    finally:
+        gc.enable()

@@ -19,13 +19,19 @@ def meshes(count, folder="/anywhere"):
     ]
 
 
+def sides(meshes):
+    """The meshes to train on, and the held-out ones, as files."""
+    training, held_out = hold_out(meshes)
+    return training, [mesh.source for mesh in held_out]
+
+
 def names(sources):
     return {source.name for source in sources}
 
 
 @pytest.mark.parametrize("count", [2, 3, 12, 1000])
 def test_every_mesh_is_on_one_side_and_none_is_empty(count):
-    training, held_out = hold_out(meshes(count))
+    training, held_out = sides(meshes(count))
     assert names(training) | names(held_out) == names(m.source for m in meshes(count))
     assert len(training) + len(held_out) == count and training and held_out
     assert training == sorted(training, key=lambda s: int(s.name[4:]))  # their order
@@ -34,8 +40,8 @@ def test_every_mesh_is_on_one_side_and_none_is_empty(count):
 
 
 def test_a_mesh_stays_on_its_side_as_the_collection_grows():
-    small, large = (names(hold_out(meshes(n))[0]) for n in (300, 3000))
-    assert small <= large and not small & names(hold_out(meshes(3000))[1])
+    small, large = (names(sides(meshes(n))[0]) for n in (300, 3000))
+    assert small <= large and not small & names(sides(meshes(3000))[1])
 
 
 def test_names_order_and_place_of_the_files_do_not_matter():
@@ -43,8 +49,8 @@ def test_names_order_and_place_of_the_files_do_not_matter():
         mesh._replace(source=mesh.source._replace(name=f"x/{mesh.source.name}"))
         for mesh in reversed(meshes(50, "/other"))
     ]
-    held_out = {f"x/{name}" for name in names(hold_out(meshes(50))[1])}
-    assert names(hold_out(renamed)[1]) == held_out
+    held_out = {f"x/{name}" for name in names(sides(meshes(50))[1])}
+    assert names(sides(renamed)[1]) == held_out
 
 
 def test_copies_are_on_one_side():
@@ -55,7 +61,7 @@ def test_copies_are_on_one_side():
                    signature=tuple(np.round(m.signature, 4)))
         for i, m in enumerate(ours)
     ]  # fmt: skip
-    training, held_out = hold_out(ours + copies)
+    training, held_out = sides(ours + copies)
     for side in (training, held_out):
         kept = [int(source.name.split("-")[1]) for source in side]
         assert sorted(kept[::2]) and all(kept.count(i) == 2 for i in kept)
@@ -66,7 +72,7 @@ def test_what_cannot_be_used_is_never_held_out():
         m._replace(signature=(), skipped=Skipped(m.source.name, "empty", "Nothing."))
         for m in meshes(40)[:20]
     ]
-    training, held_out = hold_out(broken + meshes(40)[20:])
+    training, held_out = sides(broken + meshes(40)[20:])
     assert len(training) + len(held_out) == 40
     assert names(held_out) <= {f"mug-{i}" for i in range(20, 40)}
 

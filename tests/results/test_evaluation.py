@@ -13,7 +13,7 @@ from marks import slow
 from jaxshape.data.capture import camera_distance, capture, measure_frames
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.dataset import hash_seed
-from jaxshape.data.meshes import Model
+from jaxshape.data.meshes import Model, Skipped
 from jaxshape.geometry import camera, fusion
 from jaxshape.geometry.grids import Grids, binary
 from jaxshape.geometry.overlap import iou
@@ -180,6 +180,13 @@ def test_a_mesh_no_pixel_meets_is_skipped_with_a_reason(linear_prior, models):
     config = replace(CONFIG, frames=(1,), methods=("encoder",))
     speck, chair = evaluate(linear_prior, [Model("speck", speck, {}), models[0]], config)
     assert speck.reason == "nothing measured" and chair["name"] == "chair-0"
+
+
+def test_a_mesh_that_cannot_be_read_any_more_is_passed_on(linear_prior, models):
+    gone = Skipped("gone", "unreadable", "No such file.")
+    config = replace(CONFIG, frames=(1,), methods=("encoder",))
+    (chair,) = evaluate(linear_prior, models[:1], config)
+    assert list(evaluate(linear_prior, [gone, models[0], gone], config)) == [gone, gone, chair]
 
 
 def test_what_methods_have_in_common_is_computed_once(linear_prior):
