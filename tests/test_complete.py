@@ -40,6 +40,28 @@ def test_complete_writes_a_mesh_where_the_cloud_lies(run, scan, tmp_path, linear
     assert np.median(near) < 0.03  # what was measured is in the mesh, in the frame of the file
 
 
+def test_large_coordinates_and_unseen_parts_are_said(run, tmp_path, linear_weights):
+    """The upper half of a chair in centimetres, in the coordinates of a map, as doubles."""
+    points = sample_surface(random_chair(2), 5000, 0)
+    points = 100 * points[points[:, 1] > 0] + [500_000, 5_400_000, 300]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    header += [f"property double {axis}" for axis in "xyz"] + ["end_header"]
+    rows = [" ".join(f"{x:.3f}" for x in row) for row in points]
+    (tmp_path / "scan.ply").write_text("\n".join([*header, *rows, ""]))
+    options = ("--method", "encoder", "--weights", linear_weights, "--output", tmp_path / "out")
+    axes = ("--up", "y", "--front", "z", "--unit", "cm")
+    status, _, err = run("complete", tmp_path / "scan.ply", *axes, *options)
+    assert status in (0, 3), err
+    assert "The coordinates are large" in err and "taken as cm" not in err
+    result = json.loads((tmp_path / "out/result.json").read_text())
+    assert result["metres_in_a_unit"] == pytest.approx(0.01)
+    mesh = trimesh.load(tmp_path / "out/mesh.ply")
+    points = points - result["offset"]
+    assert np.abs(points).max() < 100
+    near = KDTree(sample_surface(mesh, 50_000, 0)).query(points)[0]
+    assert np.median(near) < 3
+
+
 def test_what_cannot_be_completed_is_refused(run, scan, tmp_path, linear_weights):
     options = ("--weights", linear_weights, "--output", tmp_path / "out")
     for arguments, said in (

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 from jaxshape.claim import Output
 from jaxshape.cli.common import console, require, warn
 from jaxshape.cli.rebuild import Rebuild, report_objective, written
-from jaxshape.data.config import Axis
+from jaxshape.data.config import Axis, UnitName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,12 +33,16 @@ class Complete(Rebuild):
     """Axis of the file that points up; estimated by default."""
     front: Axis | None = None
     """Axis of the file towards which the object faces; estimated by default."""
+    unit: UnitName | None = None
+    """Unit of the file; by default the one of m, cm and mm with which the cloud is as large as an
+    object in a room."""
     sensor: tuple[float, float, float] | None = None
     """Position of the sensor, in the frame and unit of the file, if all points were measured from
     one position; a .pcd file may contain it."""
     output: Path = Path("out/complete")
     """Folder for mesh.glb (in metres), mesh.ply (in the frame and the unit of the file), grid.npz,
-    result.json, overview.png and report.html."""
+    result.json, overview.png and report.html. If the coordinates of the file are too large for the
+    single precision of meshes, mesh.ply lacks their `offset` in result.json."""
 
     @property
     def writes(self) -> Output:
@@ -49,7 +53,8 @@ class Complete(Rebuild):
         start = time.perf_counter()
         import numpy as np
 
-        from jaxshape.data.clouds import read_cloud
+        from jaxshape.data.clouds import moved, offset_of, read_cloud
+        from jaxshape.mapping.map.doubts import unseen_of_points
         from jaxshape.mapping.placement.cloud_placing import cloud_grids, place_cloud
         from jaxshape.mapping.tracking.keyframes import place_of
         from jaxshape.results.output import Observation
@@ -65,19 +70,27 @@ class Complete(Rebuild):
         if self.sensor is not None:
             require(bool(np.isfinite(self.sensor).all()), "--sensor is not finite; give x y z.")
             cloud = cloud._replace(sensor=np.array(self.sensor))
+        offset = offset_of(cloud)
+        cloud = moved(cloud, -offset)
         prior, refiner, config = self.prepare()
         with console.status("finding which way is up"):
             placed = place_cloud(
-                cloud, self.placer(prior), up=self.up, front=self.front, seed=self.seed
+                cloud,
+                self.placer(prior),
+                up=self.up,
+                front=self.front,
+                unit=self.unit,
+                seed=self.seed,
             )
-        warnings = [*placed.warnings, *_of_rays(cloud)]
+        warnings = [*placed.warnings, *_of_rays(cloud), *_of_offset(offset)]
         for warning in warnings:
             warn(warning)
         frame = place_of(placed.box, prior.resolution).frame
         grids = cloud_grids(cloud, placed, frame, prior.resolution, seed=self.seed)
         require_measured(np.asarray(grids.occupied))
         found = self.searched(prior, refiner, config, grids)
-        T = placed.box.T_world_object
+        T, size = placed.box.T_world_object, placed.box.size
+        points = (placed.metres * np.asarray(cloud.points, np.float64) - T[:3, 3]) @ T[:3, :3]
         observation = Observation(
             depth=[],
             occupied=np.asarray(grids.occupied),
@@ -85,15 +98,17 @@ class Complete(Rebuild):
             frame=frame,
             T_world_object=np.diag([1 / placed.metres] * 3 + [1.0]) @ T,
             truth=None,
-            cloud=(placed.metres * np.asarray(cloud.points, np.float64) - T[:3, 3]) @ T[:3, :3],
+            cloud=points,
+            unseen=unseen_of_points(points, size),
         )
         figures: dict[str, Any] = {"object": str(self.scan), **self.settings(prior, "points")}
         figures |= {"points": len(cloud.points), "up": placed.up, "metres_in_a_unit": placed.metres}
-        figures["box"] = {"T_world_object": T.tolist(), "size": placed.box.size.tolist()}
+        figures |= {"offset": offset.tolist()}
+        figures["box"] = {"T_world_object": T.tolist(), "size": size.tolist()}
         figures |= {"warnings": warnings, "seconds": round(time.perf_counter() - start, 2)}
         result = written(self.output, observation, found, figures)
-        size = " x ".join(f"{extent:.2f}" for extent in placed.box.size)
-        print(f"{len(cloud.points)} points of an object of {size} m, {placed.up} is up")
+        extents = " x ".join(f"{extent:.2f}" for extent in size)
+        print(f"{len(cloud.points)} points of an object of {extents} m, {placed.up} is up")
         report_objective(result)
         print(verdict_in_words(result))
         print(f"wrote mesh.glb, mesh.ply, result.json, overview.png, report.html to {self.output}")
@@ -108,3 +123,10 @@ def _of_rays(cloud: Any) -> list[str]:
         "Neither the sensor's position nor normals are known, so free space cannot be "
         "distinguished from unseen surface; give --sensor, or a file with normals."
     ]
+
+
+def _of_offset(offset: Any) -> list[str]:
+    if not offset.any():
+        return []
+    said = " ".join(f"{x:.0f}" for x in offset)
+    return [f"The coordinates are large: mesh.ply lies at {said} less than those of the file."]

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from jaxshape.data.archives import MeshSource, read_bytes
 from jaxshape.data.formats.ply import parse_ply
@@ -20,6 +21,16 @@ MAX_POINTS = 200_000
 
 FEWEST = 100
 """Smallest number of points that can be completed."""
+
+NEIGHBOURS, FARTHER, FAR = 8, 8.0, 0.05
+"""A point is a stray if the distance to its eighth neighbour is over eight times that of nearly all
+points, and over a twentieth of the cloud's extent."""
+
+LARGE = 2000
+"""Coordinates are large from so many extents of the cloud on."""
+
+STEPS = 256
+"""Least number of steps that single precision must leave to the coordinates within the cloud."""
 
 
 class Cloud(NamedTuple):
@@ -62,14 +73,14 @@ def read_cloud(path: str | os.PathLike[str], *, seed: int = 0) -> Cloud:
         raise ValueError(f"{path} is no point cloud; expected {' or '.join(SUFFIXES)}: convert it.")
     try:
         content = read_bytes(MeshSource(path.stem, str(path)))
-        found = _read_ply(content, seed) if kind == ".ply" else _read_pcd(content)
+        found = _measured(_read_ply(content, seed) if kind == ".ply" else _read_pcd(content))
     except Exception as error:  # parsers of foreign files may raise anything
         reason = " ".join(f"{error or type(error).__name__}".split())[:300].rstrip(".")
         raise ValueError(
             f"{path} cannot be read as a point cloud ({reason}); expected a whole PLY or PCD file: "
             "save it again."
         ) from error
-    cloud = _drawn(_measured(found), seed)
+    cloud = _drawn(found, seed)
     if len(cloud.points) < FEWEST or np.ptp(cloud.points, axis=0).max() == 0:
         raise ValueError(
             f"{path} holds {len(cloud.points)} usable points; expected {FEWEST} or more, of one "
@@ -90,16 +101,39 @@ def surrounds(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, " 3"]) 
     return bool(((points.min(axis=0) < place) & (place < points.max(axis=0))).all())
 
 
+def moved(cloud: Cloud, by: Float[np.ndarray, " 3"]) -> Cloud:
+    """The cloud at another place.
+
+    Args:
+        cloud: The cloud.
+        by: How far it is moved, in its unit.
+    """
+    sensor = None if cloud.sensor is None else cloud.sensor + by
+    return cloud._replace(points=cloud.points + by, sensor=sensor)
+
+
+def offset_of(cloud: Cloud) -> Float[np.ndarray, " 3"]:
+    """The middle of a cloud in whole units if its coordinates are large (`LARGE`), else zeros.
+
+    Args:
+        cloud: The cloud.
+    """
+    if np.abs(cloud.points).max() < LARGE * np.ptp(cloud.points, axis=0).max():
+        return np.zeros(3)
+    return np.rint(np.median(cloud.points, axis=0))
+
+
 def without_strays(cloud: Cloud) -> Cloud:
-    """The cloud without points that are farther from all but a hundredth of the others than these
-    are from each other, as when a pixel at an edge is measured in the air.
+    """The cloud without single points and small groups that are far from all others, as when a
+    pixel at an edge is measured in the air.
 
     Args:
         cloud: The cloud.
     """
     low, high = np.quantile(cloud.points, (0.01, 0.99), axis=0)
-    reach = (high - low).max()
-    kept = ((cloud.points > low - reach) & (cloud.points < high + reach)).all(axis=1)
+    distance = KDTree(cloud.points).query(cloud.points, k=NEIGHBOURS + 1)[0][:, -1]
+    usual = np.quantile(distance, 0.95)
+    kept = distance <= max(FARTHER * usual, FAR * (high - low).max())
     normals = None if cloud.normals is None else cloud.normals[kept]
     return cloud._replace(points=cloud.points[kept], normals=normals)
 
@@ -151,7 +185,21 @@ def _measured(cloud: Cloud) -> Cloud:
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         is_known = np.isfinite(lengths).all() and (lengths > 1e-6).all()
         normals = normals / lengths if is_known else None
+    _require_precision(cloud.points[kept])
     return Cloud(cloud.points[kept], normals, cloud.sensor)
+
+
+def _require_precision(points: Float[np.ndarray, "n 3"]) -> None:
+    """Refuse coordinates so large that the single precision of their file has rounded the shape."""
+    if not len(points):
+        return
+    step = float(np.spacing(np.float32(np.abs(points).max())))
+    is_rounded = (points == points.astype(np.float32)).all()
+    if is_rounded and STEPS * step > np.ptp(points, axis=0).max():
+        raise ValueError(
+            f"its coordinates reach {np.abs(points).max():.3g}, where single precision has steps "
+            f"of {step:.2g}: subtract their middle before the file is written, or write doubles"
+        )
 
 
 def _drawn(cloud: Cloud, seed: int) -> Cloud:

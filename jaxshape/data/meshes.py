@@ -266,9 +266,13 @@ def in_metres(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def axes_to_canonical(up: str, front: str) -> Float[np.ndarray, "3 3"]:
     """Return the rotation that maps the axis named `up` to +y and the one named `front` to +z."""
     check_axes(up, front)
-    y, z = ((-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[-1])]
-            for axis in (up, front))  # fmt: skip
+    y, z = axis_named(up), axis_named(front)
     return np.stack([np.cross(y, z), y, z])
+
+
+def axis_named(name: str) -> Float[np.ndarray, " 3"]:
+    """The direction of an axis, as "y" or "-z"."""
+    return (-1.0 if name[0] == "-" else 1.0) * np.eye(3)["xyz".index(name[-1])]
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.ndarray, "n 3"]:

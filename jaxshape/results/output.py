@@ -51,7 +51,7 @@ class Observation(NamedTuple):
         sensor: How the noise of depth grows.
         keyframes: The keyframes that the mesh is judged by; without any it is not judged.
         floor: Height of the floor in the object frame, in metres; NaN where it is not known.
-        unseen: Parts of the object that no keyframe saw.
+        unseen: Parts of the object that no keyframe saw, or of which the cloud shows nothing.
         soft: F and M as given to the prior; `occupied` and `occluded` are their rounded values.
             None for binary ones.
         cloud: Points in the object frame that the mesh is judged by where there are no keyframes
@@ -214,7 +214,11 @@ def _judged(observation: Observation, found: ShapeMesh, is_mirrored: bool) -> di
     if observation.cloud is not None:
         voxel = float(np.max(observation.frame.voxel_size))
         quality = quality_of_cloud(
-            found.mesh, observation.cloud, voxel=voxel, is_mirrored=is_mirrored
+            found.mesh,
+            observation.cloud,
+            voxel=voxel,
+            is_mirrored=is_mirrored,
+            unseen=observation.unseen,
         )
     else:
         quality = quality_of(

@@ -146,6 +146,7 @@ def quality_of_cloud(
     *,
     voxel: float,
     is_mirrored: bool = False,
+    unseen: Unseen = ALL_SEEN,
 ) -> Quality:
     """Compare a mesh with the point cloud it was completed from.
 
@@ -155,15 +156,18 @@ def quality_of_cloud(
         voxel: Largest edge of the voxels that the mesh was made from, in metres: mesh and points
             cannot be told apart at smaller distances.
         is_mirrored: Whether hidden parts were completed from their mirror image.
+        unseen: Parts of the object of which the cloud shows nothing.
 
     Returns:
-        The figures; nothing is known about free space, the floor and unseen parts.
+        The figures; nothing is known about free space and the floor.
     """
     close = max(CLOSE, voxel)
     measured = np.isfinite(KDTree(points).query(mesh.vertices, distance_upper_bound=close)[0])
     some = points[:: max(1, len(points) // _POINTS)]
     is_near = _distance(mesh, some) < close
-    return _of_mesh(mesh, measured, is_mirrored)._replace(explained=float(np.mean(is_near)))
+    return _of_mesh(mesh, measured, is_mirrored)._replace(
+        explained=float(np.mean(is_near)), unseen_faces=unseen.faces, unseen_below=unseen.below
+    )
 
 
 def _of_mesh(

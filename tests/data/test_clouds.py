@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxshape.data.clouds import MAX_POINTS, read_cloud
+from jaxshape.data.clouds import MAX_POINTS, Cloud, moved, offset_of, read_cloud
 from jaxshape.data.pcd import parse_pcd
 
 POINTS = np.round(np.random.default_rng(0).normal(size=(300, 3)), 4).astype(np.float32)
@@ -182,3 +182,23 @@ def test_too_few_points_are_no_shape(tmp_path):
     write_pcd(tmp_path / "scan.pcd", "ascii", points=POINTS[:20], normals=NORMALS[:20])
     with pytest.raises(ValueError, match="20 usable points"):
         read_cloud(tmp_path / "scan.pcd")
+
+
+def test_coordinates_that_single_precision_has_rounded_are_refused(tmp_path):
+    """Those of a map in metres from the equator; in double precision they keep the shape."""
+    far = POINTS + [500_000.0, 5_400_000.0, 300.0]
+    for kind, name in ((np.float32, "float"), (np.float64, "double")):
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(far)}"]
+        header += [f"property {name} {axis}" for axis in "xyz"]
+        content = "\n".join([*header, "end_header\n"]).encode() + far.astype(kind).tobytes()
+        (tmp_path / f"{name}.ply").write_bytes(content)
+    with pytest.raises(ValueError, match=r"steps of 0\.5: subtract their middle"):
+        read_cloud(tmp_path / "float.ply")
+    cloud = read_cloud(tmp_path / "double.ply")
+    offset = offset_of(cloud)
+    np.testing.assert_array_equal(offset, np.rint(offset))
+    np.testing.assert_allclose(offset, [500_000, 5_400_000, 300], atol=2)
+    near = moved(cloud._replace(sensor=offset + 1.0), -offset)
+    np.testing.assert_allclose(near.points, far - offset)
+    assert near.sensor is not None and near.sensor.tolist() == [1, 1, 1]
+    assert not offset_of(Cloud(POINTS + 100.0, None, None)).any()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from jaxshape.mapping.map.doubts import unseen_of_points
 from jaxshape.results.summary import verdict_in_words
 from jaxshape.results.verdict import (
     Quality,
@@ -128,6 +129,14 @@ def test_a_completed_cloud_is_judged_by_its_points():
     assert found.explained == 1 and judged(found).word == "good"
     assert 0.3 < found.measured < 0.5 and found.mirrored == 0
     assert quality_of_cloud(mesh, points, voxel=0.015, is_mirrored=True).mirrored > 0.2
+    unseen = unseen_of_points(points, mesh.extents + [0.2, 0.0, 0.0])
+    assert unseen.faces == ("left side", "right side") and unseen.below < 0.01
+    partly = quality_of_cloud(mesh, points, voxel=0.015, unseen=unseen)
+    assert (
+        judged(partly).word == "doubtful" and "left side and right side" in judged(partly).sentence
+    )
+    upper = unseen_of_points(mesh.vertices[mesh.vertices[:, 1] > 0], mesh.extents)
+    assert upper.faces == ("bottom",) and upper.below == pytest.approx(0.5, abs=0.1)
     away = quality_of_cloud(mesh, points + [0.0, 0.1, 0.0], voxel=0.015)
     assert away.explained == pytest.approx(0.5, abs=0.25)
     assert judged(away).word != "good"

@@ -1,15 +1,25 @@
 """Clouds become F and M by rays, and are placed by the prior as they stand."""
 
+import itertools
+
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 
 from jaxshape.data.boxes import Box
 from jaxshape.data.chairs import random_chair
 from jaxshape.data.clouds import Cloud, without_strays
-from jaxshape.data.meshes import axes_to_canonical, sample_oriented
+from jaxshape.data.meshes import axes_to_canonical, axis_named, sample_oriented
 from jaxshape.geometry.grid import GridFrame
-from jaxshape.mapping.placement.cloud_placing import PlacedCloud, cloud_grids, place_cloud
+from jaxshape.mapping.placement import cloud_placing
+from jaxshape.mapping.placement.cloud_placing import (
+    AXES,
+    SEARCH,
+    PlacedCloud,
+    cloud_grids,
+    place_cloud,
+)
 from jaxshape.model.weights import load_prior
 
 N = 32
@@ -90,6 +100,82 @@ def test_a_sensor_within_the_object_is_refused():
             place_cloud(Cloud(points, None, np.array(place)), load_prior("chair-autoencoder"))
 
 
+@pytest.mark.parametrize(
+    "extent, metres, said",
+    [
+        (0.4, 1.0, ""),
+        (2.8, 1.0, ""),
+        (95.7, 0.01, "taken as cm"),
+        (860.0, 0.001, "taken as mm"),
+        (12.0, 0.86 / 12, "no length is measured"),
+        (0.1, 8.6, "no length is measured"),
+    ],
+)
+def test_the_unit_is_the_one_of_a_plausible_size(extent, metres, said):
+    found, warnings = cloud_placing._metres(Cloud(wall(extent), None, None), SEARCH)
+    assert found == pytest.approx(metres) and len(warnings) == (said != "")
+    assert all(said in warning for warning in warnings)
+
+
+def test_up_may_be_the_normal_of_a_plane_between_the_axes():
+    level = wall()[:, [0, 2, 1]]  # a square in the plane of x and z
+    turn = jaxlie.SO3.from_x_radians(jnp.deg2rad(25.0)).as_matrix()
+    tilted = Cloud(level @ np.asarray(turn).T, None, None)
+    found = cloud_placing._directions(tilted, 1.0, None)
+    assert len(found) == len(AXES) + 2
+    cosines = [normal @ np.asarray(turn)[:, 1] for normal in found.values()]
+    assert max(cosines) > 0.999 and min(cosines) < -0.999
+    assert len(cloud_placing._directions(Cloud(level, None, None), 1.0, None)) == len(AXES)
+    assert list(cloud_placing._directions(tilted, 1.0, "-z")) == ["-z"]
+
+
+@pytest.mark.parametrize("front", [None, "x"])
+def test_a_level_frame_has_up_along_y_and_turns_the_front_as_little_as_possible(front):
+    up = np.array([0.0, -0.6, 0.8])
+    R = cloud_placing._level(up, front)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(R @ up, [0, 1, 0], atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    if front == "x":
+        np.testing.assert_allclose(R @ [1.0, 0, 0], [0, 0, 1], atol=1e-12)
+    for up, front in itertools.permutations(AXES, 2):
+        if up[-1] != front[-1]:
+            np.testing.assert_array_equal(
+                cloud_placing._level(axis_named(up), front), axes_to_canonical(up, front)
+            )
+
+
+@pytest.mark.slow
+def test_a_chair_stands_on_its_lowest_point_unless_its_legs_are_missing():
+    mesh = random_chair(3)
+    points, _ = sample_oriented(mesh, 20_000, 0)
+    prior, bottom = load_prior("chair-autoencoder"), mesh.bounds[0, 1]
+
+    def bottom_of(kept):
+        found = place_cloud(Cloud(points[kept], None, None), prior, up="y", front="z")
+        return found.box.T_world_object[1, 3] - found.box.size[1] / 2
+
+    assert bottom_of(slice(None)) == pytest.approx(bottom, abs=0.02)
+    above = points[:, 1] > bottom + 0.35 * mesh.extents[1]
+    assert bottom_of(above) < bottom + 0.2 * mesh.extents[1]
+
+
+@pytest.mark.slow
+def test_a_tilted_chair_far_from_the_origin_in_centimetres_with_strays_is_placed():
+    mesh = random_chair(3)
+    points, _ = sample_oriented(mesh, 20_000, 0)
+    turn = np.asarray(jaxlie.SO3.from_x_radians(jnp.deg2rad(155.0)).as_matrix(), np.float64)
+    strays = np.array([[0, 1.9, 0], [0.1, -1.8, 0.3]])
+    place = np.array([5e5, 5.4e6, 300.0])
+    cloud = Cloud(100 * np.concatenate([points, strays]) @ turn.T + place, None, None)
+    found = place_cloud(cloud, load_prior("chair-autoencoder"))
+    T = found.box.T_world_object
+    assert found.metres == pytest.approx(0.01) and T[:3, 1] @ turn[:, 1] > np.cos(0.1)
+    np.testing.assert_allclose(T[:3, 3] / found.metres, place, atol=6)
+    np.testing.assert_allclose(found.box.size, mesh.extents, atol=0.12)
+    assert any("2 points lie far away" in warning for warning in found.warnings)
+
+
 def test_points_far_from_all_others_do_not_count():
     normals = np.repeat([[0.0, 0.0, 1.0]], 40_000, 0)
     cloud = Cloud(wall(), normals, None)
@@ -99,6 +185,10 @@ def test_points_far_from_all_others_do_not_count():
     kept = without_strays(many)
     np.testing.assert_array_equal(kept.points, cloud.points)
     assert kept.normals is not None and len(kept.normals) == 40_000
+    near = Cloud(np.concatenate([wall(count=60), [[0, 0, 0.5], [0.2, 0.1, -0.4]]]), None, None)
+    assert len(without_strays(near).points) == 3600
+    twice = Cloud(np.repeat(wall(count=60), 10, axis=0), None, None)
+    assert len(without_strays(twice).points) == 36_000
 
 
 def test_axes_that_are_not_perpendicular_are_refused():
