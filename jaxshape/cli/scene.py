@@ -34,7 +34,7 @@ class BuildScene(Recorded):
     """Further classes and their weights, in addition to those of the package: NAME FILE ..."""
     method: str | None = None
     """Search method, as in `jaxshape reconstruct`; None for the default of each network."""
-    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig()
+    search: tyro.conf.OmitArgPrefixes[RefineConfig] = RefineConfig(samples=16)
     seed: int = 0
     """Seed of all random numbers, 0 or more."""
     poses: Literal["auto", "none"] = "auto"

@@ -88,10 +88,15 @@ def _kept(path: Path) -> dict[str, np.ndarray]:
     names = ("F", "M", "occupied", "occluded", "samples")
     kept = reading.read_arrays(path, names) if path.is_file() else {}
     F, M = kept.get("F", kept.get("occupied")), kept.get("M", kept.get("occluded"))
-    if F is None or M is None or "samples" not in kept:
+    if F is None or M is None:
         raise ValueError(
-            f"{str(path.parent)!r} holds no grid.npz with F, M and samples; give a finished folder "
-            "of jaxshape reconstruct or demo, made without --samples 0."
+            f"{str(path.parent)!r} holds no grid.npz with F and M; give a finished folder of "
+            "jaxshape reconstruct or demo, or an object of jaxshape scene."
+        )
+    if "samples" not in kept:
+        raise ValueError(
+            f"{str(path)!r} holds no samples of the shape (objects of no class have none); make the "
+            "folder anew, with --samples 16."
         )
     kind = np.float32 if "F" in kept else bool
     return {"F": F.astype(kind), "M": M.astype(kind), "samples": kept["samples"]}

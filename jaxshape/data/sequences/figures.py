@@ -55,6 +55,7 @@ class Depths(NamedTuple):
         damaged: A sentence for each image that could not be read.
         beyond: A number that far more pixels hold than depths near it, as where nothing was
             measured, and the share of the valid pixels that hold it; None without one.
+        negative: Share of pixels with a negative number, from 0 to 1.
     """
 
     median: float
@@ -64,6 +65,7 @@ class Depths(NamedTuple):
     black: int
     damaged: tuple[str, ...]
     beyond: tuple[float, float] | None = None
+    negative: float = 0.0
 
 
 class Poses(NamedTuple):
@@ -121,6 +123,7 @@ def depths_of(sequence: Sequence) -> Depths:
         black=int(np.sum(~valid.any(axis=(1, 2)))),
         damaged=tuple(map(str, damaged)),
         beyond=_beyond(values[valid]),
+        negative=float(np.mean(values < 0)),
     )
 
 

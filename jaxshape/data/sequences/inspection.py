@@ -29,6 +29,9 @@ from jaxshape.data.sequences.hypotheses import Reading, reading_of
 _USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; outside, a scale is doubted, not refused
 _SLOW = 0.2  # depth images per second; below, times are hardly in seconds
 
+NEGATIVE = 0.1
+"""Share of negative pixels from which depth has the other sign."""
+
 BADLY = 0.5
 """Agreement of poses and depth images below which a reconstruction must fail."""
 
@@ -133,12 +136,18 @@ def _of_images(depths: Depths, pictures: tuple[str, ...]) -> Iterator[Finding]:
             yield Finding(
                 f"sampled {kind} that cannot be used: {len(damaged)}; {damaged[0]}", skipped
             )
-    if depths.black:
+    if depths.negative > NEGATIVE:
+        yield Finding(
+            f"{depths.negative:.0%} of the depth pixels are negative, as along the z axis of "
+            "OpenGL's cameras",
+            "They count as not measured; write their absolute values.",
+        )
+    elif depths.black:
         yield Finding(
             f"{depths.black} of {depths.sampled} sampled depth images hold no valid depth at all",
             "Nothing can be tracked there; leave them out if they are at the start.",
         )
-    if depths.invalid > 0.5:
+    if depths.invalid - depths.negative > 0.5:
         yield Finding(
             f"{depths.invalid:.0%} of the depth pixels hold nothing, "
             f"{depths.saturated:.0%} are saturated",

@@ -41,7 +41,7 @@ def test_a_good_recording(tmp_path, name):
     assert found.warnings == () and found.gaps == ()
     assert (found.colors, found.masks) == (12, 12)
     assert found.depths.median == pytest.approx(np.median(SEEN.depth))
-    assert found.depths[1:] == (0, 0, 12, 0, (), None)
+    assert found.depths[1:] == (0, 0, 12, 0, (), None, 0)
     steps = np.diff(SEEN.T_world_camera[:, :3, 3], axis=0)
     assert found.poses.known == 12 and found.poses.damaged == ()
     assert found.poses.length == pytest.approx(np.linalg.norm(steps, axis=1).sum(), rel=1e-4)
@@ -138,6 +138,18 @@ def test_damaged_black_and_saturated_images(tmp_path):
     assert "sampled depth images that cannot be used: 1; " in warnings
     assert "7 of 11 sampled depth images hold no valid depth" in warnings
     assert "64% of the depth pixels hold nothing, 55% are saturated" in warnings
+
+
+def test_depth_of_the_other_sign_is_named(tmp_path):
+    write_open3d(tmp_path, SEEN)
+    for i, depth in enumerate(SEEN.depth):
+        (tmp_path / f"depth/depth_{i}.png").unlink()
+        np.save(tmp_path / f"depth/depth_{i}.npy", -depth.astype(np.float32))
+    found = inspect_sequence(open_sequence(tmp_path))
+    assert found.depths.negative > 0.5
+    said = [one for one in found.warnings if "are negative" in one.evidence]
+    assert len(said) == 1 and "absolute values" in said[0].sentence
+    assert not any("out of the sun" in one.sentence for one in found.warnings)
 
 
 @pytest.mark.parametrize("kind", [np.int32, np.float32])
