@@ -19,6 +19,7 @@ from jaxshape.data.sequences.figures import (
     turned_pictures,
 )
 from jaxshape.data.sequences.frames import (
+    USUAL_DEPTH_SCALES,
     Finding,
     Sequence,
     depth_scale_fault,
@@ -77,7 +78,7 @@ def inspect_sequence(
         SequenceError: None of the sampled depth images can be read.
         ValueError: There is no convention of a name.
     """
-    depths, reading, used = depths_of(sequence), None, None
+    depths, reading, used, written = depths_of(sequence), None, None, sequence.depth_scale
     own = Convention(tuple(name for name in stated or () if name != AS_GIVEN))
     sequence = read_as(sequence, own)
     if sequence.has_poses:
@@ -96,6 +97,7 @@ def inspect_sequence(
         *_of_scale(depths.median, sequence.depth_scale, reading),
         *_of_camera(sequence),
         *_of_convention(reading, is_used),
+        *_of_free_scale(used, written),
         *_of_missing(poses, len(sequence)),
         *_of_gaps(gaps),
         *_of_rate(rate),
@@ -216,6 +218,20 @@ def _of_camera(sequence: Sequence) -> Iterator[Finding]:
 
 
 # Poses, gaps and times -------------------------------------------------------------------------
+
+
+def _of_free_scale(used: Convention | None, written: float) -> Iterator[Finding]:
+    """A warning that the poses may have no metric scale, where only an odd depth scale fits."""
+    scale = None if used is None else used.depth_scale
+    if scale is None or scale in USUAL_DEPTH_SCALES:
+        return
+    factor = scale / written
+    yield Finding(
+        f"no usual camera has {scale:g} depth units a metre; poses without a metric scale, as "
+        "COLMAP gives them, look the same",
+        f"If the depth images are right with {written:g} units a metre, all lengths of the result "
+        f"are {1 / factor:.3g} times the true ones: multiply the translations by {factor:.3g}.",
+    )
 
 
 def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:

@@ -98,6 +98,17 @@ def test_an_unusual_depth_scale_is_found_along_a_continuum(tmp_path):
     assert found.sequence.depth_scale == pytest.approx(3300, rel=0.05)
 
 
+def test_poses_without_a_metric_scale_may_be_the_cause_of_an_odd_depth_scale(tmp_path):
+    """Both fit alike. The factor in the advice makes the poses metric."""
+    found = inspect_sequence(write(tmp_path, shifted_by(1 / 2.7, T), SEEN.depth, 1000))
+    (said,) = [one for one in found.warnings if "COLMAP" in one.evidence]
+    factor = float(said.advice.rstrip(".").rpartition(" ")[2])
+    assert factor == pytest.approx(2.7, rel=0.05)
+    assert f"{1 / factor:.2g}" in said.advice and "1000 units a metre" in said.advice
+    usual = inspect_sequence(write(tmp_path / "usual", T, SEEN.depth, 4000))
+    assert not any("COLMAP" in one.evidence for one in usual.warnings)
+
+
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("seed", range(2))
 def test_a_right_recording_with_noise_is_left_alone(tmp_path, name, seed):
