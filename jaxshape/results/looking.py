@@ -95,8 +95,8 @@ def _kept(path: Path) -> dict[str, np.ndarray]:
         )
     if "samples" not in kept:
         raise ValueError(
-            f"{str(path)!r} holds no samples of the shape (objects of no class have none); make the "
-            "folder anew, with --samples 16."
+            f"{str(path)!r} holds no samples of the shape (objects of no class have none); make "
+            "the folder anew, with --samples 16."
         )
     kind = np.float32 if "F" in kept else bool
     return {"F": F.astype(kind), "M": M.astype(kind), "samples": kept["samples"]}
