@@ -88,7 +88,7 @@ def turned(sources: Sequence[Any], axes: Axes, prior: Any = None) -> list[Any]:
         return list(sources)
     usual = usual_axes(scores, (axes.up, axes.front))
     others = dissenting(scores, usual)
-    kept = len(sources) - len(others)
+    kept = len(scores) - len(others)
     console.print(f"{_flags(usual)} for {kept} meshes, other axes for {len(others)}.")
     return [source._replace(axes=others.get(source.name, usual)) for source in sources]
 
@@ -153,20 +153,22 @@ def _scores(
 ) -> dict[str, Any]:
     """Scores of each pair of axes for each mesh; empty if no prior knows this kind of object.
     `prior` knows its own kind, and the weights for chairs know seats."""
-    from jaxshape.data.meshes import Skipped, load, resembles_a_seat
+    from jaxshape.data.dataset import LoadedWhenNeeded
+    from jaxshape.data.meshes import Skipped, resembles_a_seat
     from jaxshape.model.facing import are_known, facing_scores
     from jaxshape.model.weights import load_prior
 
-    loaded = [load(source, unit=axes.unit) for source in sources]
-    models = [model for model in loaded if not isinstance(model, Skipped)]
-    may_be_seats = [model for model in models if resembles_a_seat(model.mesh)]
-    if prior is None and 2 * len(may_be_seats) <= len(models):
-        return {}
+    models = LoadedWhenNeeded(sources, unit=axes.unit)
+    if prior is None:
+        seats = [resembles_a_seat(one.mesh) for one in models if not isinstance(one, Skipped)]
+        if 2 * sum(seats) <= len(seats):
+            return {}
     known = load_prior(None) if prior is None else prior
     with progress_bar("meshes") as bar:
         task = bar.add_task("axes", note="")
         scores = {
             model.name: facing_scores(known, model.mesh, ups)
             for model in bar.track(models, task_id=task)
+            if not isinstance(model, Skipped)
         }
     return scores if prior is not None or are_known(scores) else {}
