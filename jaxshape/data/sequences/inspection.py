@@ -98,6 +98,7 @@ def inspect_sequence(
         *_of_camera(sequence),
         *_of_convention(reading, is_used),
         *_of_free_scale(used, written),
+        *_of_mirrored(used, sequence),
         *_of_missing(poses, len(sequence)),
         *_of_gaps(gaps),
         *_of_rate(rate),
@@ -232,6 +233,23 @@ def _of_free_scale(used: Convention | None, written: float) -> Iterator[Finding]
         f"If the depth images are right with {written:g} units a metre, all lengths of the result "
         f"are {1 / factor:.3g} times the true ones: multiply the translations by {factor:.3g}.",
     )
+
+
+def _of_mirrored(used: Convention | None, sequence: Sequence) -> Iterator[Finding]:
+    """A warning that only depth images are turned back, where there are colours or masks too."""
+    if used is None or "mirrored" not in used.names:
+        return
+    kinds = {"colour images": "color", "masks": "mask"}
+    found = [
+        kind
+        for kind, name in kinds.items()
+        if any(getattr(files, name) is not None for files in sequence.files)
+    ]
+    if found:
+        yield Finding(
+            f"the depth images are mirrored, and {' and '.join(found)} are read as they are",
+            "If they are mirrored as well, as in streams of OpenNI, mirror these files.",
+        )
 
 
 def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:

@@ -63,7 +63,8 @@ def write(folder, poses, depth, scale):
 @pytest.mark.parametrize("name", WRITTEN)
 def test_each_convention_is_found_named_and_undone(tmp_path, name):
     found = inspect_sequence(write(tmp_path, *WRITTEN[name]))
-    (warning,) = found.warnings
+    warning, *others = found.warnings
+    assert len(others) == (name == "mirrored")  # its colours and masks
     stated = f"--convention {name}" if not name.startswith("--") else name
     assert f"It is read in this convention. {stated} confirms it" in warning.advice, warning
     assert "then 9" in warning.evidence and found.poses.is_used and found.poses.agreement > 0.95
@@ -91,6 +92,18 @@ def test_what_is_denied_or_known_is_named_but_not_used(tmp_path):
     found = inspect_sequence(write(tmp_path / "b", T, SEEN.depth, 4000), keep_scale=True)
     assert found.sequence.depth_scale == 1000 and not found.poses.is_used
     assert "Is --depth-scale 4000 meant?" in found.warnings[0].advice
+
+
+def test_colours_beside_mirrored_depth_are_named(tmp_path):
+    found = inspect_sequence(write(tmp_path, *WRITTEN["mirrored"]))
+    assert "colour images and masks are read as they are" in found.warnings[1].evidence
+    for path in tmp_path.glob("*.color.png"):
+        path.unlink()
+    found = inspect_sequence(open_sequence(tmp_path))
+    assert "mirrored, and masks are read as they are" in found.warnings[1].evidence
+    for path in tmp_path.glob("*.mask.png"):
+        path.unlink()
+    assert len(inspect_sequence(open_sequence(tmp_path)).warnings) == 1
 
 
 def test_an_unusual_depth_scale_is_found_along_a_continuum(tmp_path):
