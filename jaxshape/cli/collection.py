@@ -52,16 +52,20 @@ def look_at(sources: Sequence[Any], axes: Axes, workers: int | None = None) -> l
 
 
 def usable_of(
-    sources: Sequence[Any], axes: Axes, *, refuse: bool = True
+    sources: Sequence[Any], axes: Axes, *, alone: bool = True
 ) -> tuple[list[Any], list[Any]]:
-    """The usable meshes (`Surveyed`) and the `Skipped` ones; `refuse` raises if none is usable."""
-    found = look_at(sources, axes)
+    """The usable meshes (`Surveyed`) and the `Skipped` ones.
+
+    `alone` raises if none is usable, and spreads the work over the cores; otherwise other processes
+    have meshes as well, and use the other cores.
+    """
+    found = look_at(sources, axes, workers=None if alone else 1)
     skipped = [one.skipped for one in found if one.skipped is not None]
     usable = [one for one in found if one.skipped is None]
     report_skipped(skipped)
     report_notes((one.source.name, note) for one in usable for note in one.notes)
     require(
-        bool(usable) or not refuse,
+        bool(usable) or not alone,
         f"None of the {len(sources)} meshes can be used; the first is {skipped[0].name!r}: "
         f"{skipped[0].reason}. {skipped[0].detail}"
         if skipped

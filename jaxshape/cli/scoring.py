@@ -92,7 +92,7 @@ class Evaluate:
         mine, digests, skipped = share.of(sources), {}, []
         if self.meshes:
             mine = turned(mine, self.axes, prior)
-            usable, skipped = usable_of(mine, self.axes, refuse=share.count == 1)
+            usable, skipped = usable_of(mine, self.axes, alone=share.count == 1)
             mine, digests = [one.source for one in usable], digests_of(usable)
             if self.family == "chair":  # refuse seats that lie on their side, and warn of others
                 lying = [one.source.name for one in usable if one.lies]
