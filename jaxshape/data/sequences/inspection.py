@@ -25,7 +25,7 @@ from jaxshape.data.sequences.frames import (
     depth_scale_fault,
     likely_depth_scales,
 )
-from jaxshape.data.sequences.hypotheses import Reading, reading_of
+from jaxshape.data.sequences.hypotheses import FITS, Reading, reading_of
 
 _USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; outside, a scale is doubted, not refused
 _SLOW = 0.2  # depth images per second; below, times are hardly in seconds
@@ -281,6 +281,12 @@ def _of_convention(reading: Reading | None, is_used: bool) -> Iterator[Finding]:
                 f"the poses fit the depth images badly: {reading.given:.0%} {compared}, and "
                 "no known convention fits much better",
                 "Check the depth scale, the camera, and that the poses belong to the depth images.",
+            )
+        elif reading.given < FITS and best is None:
+            yield Finding(
+                f"the poses fit the depth images less well than usual: {reading.given:.0%} "
+                f"{compared}; in correct recordings it is 80 to 99%",
+                "Check the focal length, the depth scale and the poses.",
             )
 
 

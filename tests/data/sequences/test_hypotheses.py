@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from recordings import CX, FX, WRITERS, H, W, record, write_7_scenes, write_bundlesdf, write_log
+from recordings import CX, FX, WRITERS, H, K, W, record, write_7_scenes, write_bundlesdf, write_log
 from scipy.spatial.transform import Rotation
 
 from jaxshape.data.sequences import open_sequence
@@ -92,6 +92,17 @@ def test_what_is_denied_or_known_is_named_but_not_used(tmp_path):
     found = inspect_sequence(write(tmp_path / "b", T, SEEN.depth, 4000), keep_scale=True)
     assert found.sequence.depth_scale == 1000 and not found.poses.is_used
     assert "Is --depth-scale 4000 meant?" in found.warnings[0].advice
+
+
+def test_poses_that_fit_less_well_than_usual_are_doubted(tmp_path):
+    """A focal length that is wrong enough to bend the room, but not to tear it."""
+    write(tmp_path, T, SEEN.depth, 1000)
+    wrong = np.where(np.eye(3, dtype=bool), np.diag([0.6 * FX, 0.6 * FX, 1.0]), K)
+    np.savetxt(tmp_path / "camera-intrinsics.txt", wrong)
+    found = inspect_sequence(open_sequence(tmp_path))
+    assert 0.5 < found.poses.agreement < 0.7
+    (said,) = [one for one in found.warnings if "less well than usual" in one.evidence]
+    assert "focal length" in said.advice
 
 
 def test_colours_beside_mirrored_depth_are_named(tmp_path):
