@@ -53,7 +53,8 @@ DEEPER = (0.17, 0.35, 0.52)
 EXPLAINED, POORLY, EVIDENCE = 0.05, 0.12, 0.02
 """Misfits in nats per point: below the first the points are explained as they are; above the second
 they are explained poorly. The third is the evidence that a lower bottom needs. Of eight CAD seats,
-whole or without their legs, five are below the second, and all five get the right bottom."""
+five are below the second misfit if they are whole, and four without their legs; the bottom of all
+nine is then right to 5 cm."""
 
 SEARCH = PlacementConfig(yaws=12, overhangs=(0.0, 0.25), kept=3, steps=12, steps_again=50)
 """A short search for each direction that may be up; the best one is then improved further."""
