@@ -97,6 +97,12 @@ def turned(sources: Sequence[Any], axes: Axes, prior: Any = None) -> list[Any]:
     return [source._replace(axes=others.get(source.name, usual)) for source in sources]
 
 
+def check_surveyed(usable: Sequence[Any], axes: Axes, **how: Any) -> None:
+    """`check_axes` of usable meshes, from their survey (`Surveyed`)."""
+    lying = [one.source.name for one in usable if one.lies]
+    check_axes([one.source for one in usable], lying, axes, **how)
+
+
 def check_axes(
     sources: Sequence[Any],
     lying: Sequence[str],

@@ -53,7 +53,7 @@ class Complete(Rebuild):
         start = time.perf_counter()
         import numpy as np
 
-        from jaxshape.data.clouds import moved, offset_of, read_cloud, without_strays
+        from jaxshape.data.clouds import moved, offset_of, read_cloud
         from jaxshape.mapping.map.doubts import unseen_of_points
         from jaxshape.mapping.placement.cloud_placing import cloud_grids, place_cloud
         from jaxshape.mapping.tracking.keyframes import place_of
@@ -85,7 +85,7 @@ class Complete(Rebuild):
         warnings = [*placed.warnings, *_of_rays(cloud), *_of_offset(offset)]
         for warning in warnings:
             warn(warning)
-        cloud = without_strays(cloud)
+        cloud = placed.cloud
         frame = place_of(placed.box, prior.resolution).frame
         grids = cloud_grids(cloud, placed, frame, prior.resolution, seed=self.seed)
         require_measured(np.asarray(grids.occupied))

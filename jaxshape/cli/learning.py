@@ -15,7 +15,7 @@ from jaxshape import checks, limits
 from jaxshape.claim import Output
 from jaxshape.cli.collection import (
     SAMPLE,
-    check_axes,
+    check_surveyed,
     find_meshes,
     look_at,
     turned,
@@ -110,8 +110,7 @@ class BuildDataset:
         axes = Axes(up=config.up, front=config.front, axes=self.axes, unit=config.unit)
         sources = find_meshes(meshes)
         usable = [one for one in look_at(evenly(sources, SAMPLE), axes) if one.skipped is None]
-        lying = [one.source.name for one in usable if one.lies]
-        check_axes([one.source for one in usable], lying, axes)
+        check_surveyed(usable, axes)
         return turned(sources, axes)
 
 
@@ -254,10 +253,8 @@ class Train:
         )
         sources = turned(find_meshes(self.meshes), self.axes)
         found = look_at(sources, self.axes)
-        usable = [one for one in found if one.skipped is None]
         training, held_out = hold_out(found)
-        lying = [one.source.name for one in usable if one.lies]
-        check_axes([one.source for one in usable], lying, self.axes)
+        check_surveyed([one for one in found if one.skipped is None], self.axes)
         config = replace(
             OWN_MESHES,
             up=self.axes.up,

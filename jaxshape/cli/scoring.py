@@ -12,7 +12,7 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from jaxshape.claim import Output
-from jaxshape.cli.collection import check_axes, find_meshes, turned, usable_of
+from jaxshape.cli.collection import check_surveyed, find_meshes, turned, usable_of
 from jaxshape.cli.common import progress_bar, report_skipped, require
 from jaxshape.cli.options import Axes, Machines, Seen, checked_numbers
 from jaxshape.data.config import FamilyName
@@ -95,8 +95,7 @@ class Evaluate:
             usable, skipped = usable_of(mine, self.axes, alone=share.count == 1)
             mine, digests = [one.source for one in usable], digests_of(usable)
             if self.family == "chair":  # refuse seats that lie on their side, and warn of others
-                lying = [one.source.name for one in usable if one.lies]
-                check_axes(mine, lying, self.axes, prior=prior, refuse=self.weights is None)
+                check_surveyed(usable, self.axes, prior=prior, refuse=self.weights is None)
         about = {
             "meshes": str(self.meshes or f"{self.count} procedural {self.family}s"),
             **asdict(self.axes),

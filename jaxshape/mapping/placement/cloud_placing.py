@@ -79,6 +79,7 @@ class PlacedCloud(NamedTuple):
         up: Axis of the file that points up, as "-y"; or the direction, as "0.05 -0.91 -0.42".
         misfit: Negative log-likelihood of the points, in nats per point.
         warnings: What a user should look at, in sentences.
+        cloud: The cloud without points far from all others.
     """
 
     box: Box
@@ -86,6 +87,7 @@ class PlacedCloud(NamedTuple):
     up: str
     misfit: float
     warnings: tuple[str, ...]
+    cloud: Cloud
 
 
 def place_cloud(
@@ -137,7 +139,7 @@ def place_cloud(
     metres, said = (UNITS[unit], ()) if unit else _metres(cloud, config)
     warnings += said
     middle = (cloud.points.min(axis=0) + cloud.points.max(axis=0)) / 2
-    cloud = moved(cloud, -middle)  # so that single precision is enough
+    kept, cloud = cloud, moved(cloud, -middle)  # so that single precision is enough
     if front is not None:  # the search starts from it and makes small turns
         config = replace(SEARCH, yaws=1)
     levels = {
@@ -179,7 +181,7 @@ def place_cloud(
     T[:3] = (level / metres).T @ T[:3]
     T[:3, 3] += metres * middle
     box = Box(T, np.asarray(final.size, np.float64))
-    return PlacedCloud(box, metres, best, float(final.misfit), tuple(warnings))
+    return PlacedCloud(box, metres, best, float(final.misfit), tuple(warnings), kept)
 
 
 def _perhaps_deeper(

@@ -26,8 +26,8 @@ N = 32
 FRAME = GridFrame(jnp.full(3, -0.5), jnp.full(3, 1 / N))
 
 
-def placed(metres=1.0):
-    return PlacedCloud(Box(np.eye(4), np.ones(3)), metres, "y", 0.0, ())
+def placed(cloud, metres=1.0):
+    return PlacedCloud(Box(np.eye(4), np.ones(3)), metres, "y", 0.0, (), cloud)
 
 
 def wall(side=0.6, count=200):
@@ -37,7 +37,7 @@ def wall(side=0.6, count=200):
 
 
 def states(cloud, metres=1.0):
-    grids = cloud_grids(cloud, placed(metres), FRAME, N)
+    grids = cloud_grids(cloud, placed(cloud, metres), FRAME, N)
     occupied, occluded = np.asarray(grids.occupied), np.asarray(grids.occluded)
     assert not (occupied & occluded).any()
     return occupied, ~(occupied | occluded)
