@@ -185,7 +185,8 @@ def test_a_mesh_no_pixel_meets_is_skipped_with_a_reason(linear_prior, models):
 def test_a_mesh_that_cannot_be_read_any_more_is_passed_on(linear_prior, models):
     gone = Skipped("gone", "unreadable", "No such file.")
     config = replace(CONFIG, frames=(1,), methods=("encoder",))
-    (chair,) = evaluate(linear_prior, models[:1], config)
+    # Three rows as well: programs for other numbers of rows round differently.
+    chair, *_ = evaluate(linear_prior, models[:1] * 3, config)
     assert list(evaluate(linear_prior, [gone, models[0], gone], config)) == [gone, gone, chair]
 
 
