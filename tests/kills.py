@@ -64,7 +64,7 @@ def commands(at: Path) -> dict[str, tuple[list[str], str]]:
 
 def run(arguments: Sequence[str], output: Path, after: float | None, log: Path) -> int:
     """Run a command, killed after some seconds; its exit status."""
-    argv = [sys.executable, "-m", "jaxshape.cli", *arguments, "--output", str(output)]
+    argv = [sys.executable, "-m", "jaxshape", *arguments, "--output", str(output)]
     with (
         open(log, "ab") as log_file,
         subprocess.Popen(argv, stdout=log_file, stderr=log_file, start_new_session=True) as process,

@@ -188,7 +188,7 @@ def bare(tmp_path, **more):
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 def test_names_of_any_letters_in_a_bare_environment(tmp_path, odd, encoding):
-    argv = [sys.executable, "-m", "jaxshape.cli", "inspect", odd]
+    argv = [sys.executable, "-m", "jaxshape", "inspect", odd]
     environment = bare(tmp_path, PYTHONIOENCODING=encoding)
     done = subprocess.run(argv, env=environment, capture_output=True)
     assert done.returncode == 0, done.stderr.decode(errors="replace")
@@ -196,7 +196,7 @@ def test_names_of_any_letters_in_a_bare_environment(tmp_path, odd, encoding):
 
 
 def test_a_reader_that_has_enough_ends_the_command_quietly(tmp_path, odd):
-    argv = [sys.executable, "-m", "jaxshape.cli", "inspect", odd, "--json"]
+    argv = [sys.executable, "-m", "jaxshape", "inspect", odd, "--json"]
     read, write = os.pipe()
     os.close(read)
     done = subprocess.run(argv, env=bare(tmp_path), stdout=write, stderr=subprocess.PIPE)

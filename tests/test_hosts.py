@@ -80,7 +80,7 @@ def test_two_processes_write_what_one_writes(linear_prior, tmp_path):
         address = f"127.0.0.1:{free.getsockname()[1]}"
 
     def begin(output, *machines):
-        command = [sys.executable, "-m", "jaxshape.cli", "evaluate", *OPTIONS]
+        command = [sys.executable, "-m", "jaxshape", "evaluate", *OPTIONS]
         command += ["--weights", weights, "--output", tmp_path / output, *machines]
         settings = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_PLATFORMS": "cpu"}
         return subprocess.Popen([str(x) for x in command], env=os.environ | settings)

@@ -19,6 +19,7 @@ ALONE = ("limits",)
 BELOW_ALL = (*ALONE, "checks", "reading", "files", "process", "claim")
 
 PACKAGES = ("geometry", "data", "model", "search", "mapping", "results", "report", "bench", "cli")
+MODULES = (*BELOW_ALL, *PACKAGES, "__main__")
 ROOMS = ("config", "segmentation", "tracking", "placement", "map", "scene", "views")
 """Each imports from itself and from those before it."""
 
@@ -53,7 +54,7 @@ def place(name: str, prefix: str, order: tuple[str, ...]) -> int | None:
 def against_the_way(source: str, module: str, package: str) -> list[str]:
     """What a module imports that stands later than itself."""
     names, wrong = list(imported(source, package)), []
-    for prefix, order in (("jaxshape", BELOW_ALL + PACKAGES), ("jaxshape.mapping", ROOMS)):
+    for prefix, order in (("jaxshape", MODULES), ("jaxshape.mapping", ROOMS)):
         own = place(module, prefix, order) if module != prefix else None
         if own is not None:
             wrong += [name for name in names if (place(name, prefix, order) or 0) > own]

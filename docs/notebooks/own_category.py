@@ -40,7 +40,7 @@ for seed in range(TABLES):
 
 # %%
 command = f"train --meshes tables --name table --model pca --code {CODE}"
-subprocess.run([sys.executable, "-m", "jaxshape.cli", *command.split()], check=True)
+subprocess.run([sys.executable, "-m", "jaxshape", *command.split()], check=True)
 print(Path("out/table/table.md").read_text()[:600])
 
 # %% [markdown]

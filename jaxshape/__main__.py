@@ -1,4 +1,4 @@
-"""`python -m jaxshape.cli` is `jaxshape`."""
+"""`python -m jaxshape` is `jaxshape`."""
 
 from jaxshape.cli import main
 
