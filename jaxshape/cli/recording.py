@@ -154,7 +154,7 @@ class Reconstruct(Rebuild, Recorded):
                     seconds = {"seconds": round(began - start, 2)}
                     write_progress(self.output, sequence, progress, figures | seconds, running=True)
                     took = time.perf_counter() - began
-                    next_write = time.perf_counter() + _SECONDS_BETWEEN_WRITES * max(1.0, 2 * took)
+                    next_write = time.perf_counter() + max(_SECONDS_BETWEEN_WRITES, 10 * took)
         assert progress is not None  # there is at least the first frame
         with console.status("searching the space of shapes"):
             state, shape = mapper.finish(progress.state)
@@ -206,6 +206,7 @@ class Reconstruct(Rebuild, Recorded):
 
 
 _SECONDS_BETWEEN_WRITES = 3.0
+"""Least time between two writes of the files; they never take more than a tenth of the time."""
 
 
 def _note(progress: Any) -> str:

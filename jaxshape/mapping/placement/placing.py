@@ -27,7 +27,6 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 from jax import lax
-from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxshape import checks
@@ -66,8 +65,8 @@ class PlacementConfig:
     yaws: int = 24
     overhangs: tuple[float, ...] = (0.0, 0.2, 0.5)
     kept: int = 4
-    steps: int = 60
-    steps_again: int = 25
+    steps: int = 30
+    steps_again: int = 12
 
     def __post_init__(self) -> None:
         for name in ("typical_size", "size_spread"):
@@ -231,9 +230,49 @@ def misfit(
     )
 
 
+@jax.custom_vjp
 def _look_up(values: Float[Array, "x y z"], index: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Values of a lattice, interpolated between its nodes."""
-    return map_coordinates(values, list(index.T), order=1, mode="constant", cval=EMPTY)
+    """Values of a lattice, interpolated linearly between its nodes; `EMPTY` outside of it.
+
+    Value and slope come from one gather of the eight nodes around each point: on CPUs three times
+    as fast as the derivatives of `map_coordinates`.
+    """
+    return _value_and_slope(values, index)[0]
+
+
+def _value_and_slope(values, index):
+    place = jnp.clip(index + 1, 0, len(values) + 1)  # in the lattice with a margin of one node
+    first = jnp.clip(jnp.int32(place), 0, len(values))
+
+    def around(values):
+        padded = jnp.pad(values, 1, constant_values=EMPTY)
+        return jax.vmap(lambda node: lax.dynamic_slice(padded, node, (2, 2, 2)))(first)
+
+    nodes, spread = jax.vjp(around, values)
+    shares, slopes, value = tuple((place - first).T), [], nodes
+    for axis, share in enumerate(shares):
+        slopes.append(_mixed(value[:, 1] - value[:, 0], shares[axis + 1 :]))
+        value = _mixed(value, (share,))
+    slope = jnp.where(place == index + 1, jnp.stack(slopes, axis=-1), 0)
+    return value, (slope, shares, spread)
+
+
+def _mixed(nodes: Array, shares: tuple[Array, ...]) -> Array:
+    """Interpolate between the two nodes along each axis in turn."""
+    for share in shares:
+        share = share.reshape(-1, *[1] * (nodes.ndim - 2))
+        nodes = nodes[:, 0] + share * (nodes[:, 1] - nodes[:, 0])
+    return nodes
+
+
+def _pull_back(saved, gradient):
+    slope, shares, spread = saved
+    x, y, z = (jnp.stack([1 - share, share], axis=-1) for share in shares)
+    each = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+    return *spread(gradient[:, None, None, None] * each), gradient[:, None] * slope
+
+
+_look_up.defvjp(_value_and_slope, _pull_back)
 
 
 def _corners(logits: Float[Array, "x y z"]) -> Float[Array, "x+1 y+1 z+1"]:
