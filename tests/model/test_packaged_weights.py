@@ -119,7 +119,7 @@ def test_its_codes_move_what_is_hidden_and_little_else(chair, observed):
     F, M, _ = observed
     grids = Grids(F[:1], M[:1])
     codes = jax.random.normal(jax.random.key(0), (1, 8, chair.code_size))
-    shapes = np.asarray(jax.nn.sigmoid(jax.jit(partial(decode, chair))(codes, grids)))[0]
+    shapes = np.asarray(jax.nn.sigmoid(jax.jit(decode)(chair, codes, grids)))[0]
     spread = shapes.std(axis=0)
     hidden = np.asarray(M[0])
     assert spread[hidden].mean() > 2 * spread[~hidden].mean()

@@ -77,8 +77,9 @@ class Decision(NamedTuple):
         quarters: Quarters of a turn by which its front is turned from that of its box.
         sure: Probability of the answer, from 0 to 1.
         scores: Evidence for each class, in nats per hidden surface voxel: the margin of the
-            likelihood under its prior over that in a wrong stance. A class without a front has none
-            where the size or the likelihood alone excludes it.
+            likelihood under its prior over that in a wrong stance. An object with the size of no
+            class has none, and a class without a front has none where the size or the likelihood
+            alone excludes it.
     """
 
     name: str | None
@@ -112,7 +113,7 @@ def sizes_of(name: str) -> PlacementConfig:
     """
     typical, spread = SIZES.get(name, ((0.6, 0.6, 0.6), (0.7, 0.7, 0.7)))
     return PlacementConfig(
-        typical, spread, yaws=12, overhangs=(0.0, 0.3), kept=3, steps=30, steps_again=30
+        typical, spread, yaws=12, overhangs=(0.0, 0.3), kept=3, steps=30, steps_again=12
     )
 
 
@@ -190,6 +191,10 @@ for the object to be of that class. Each deviation is in standard deviations of 
 logarithm; 0.3 % of the objects of a class have a larger sum."""
 
 
+EXCLUDED = 0.1
+"""Largest probability of a class that the size or the likelihood of an object excludes."""
+
+
 def decide(
     priors: Mapping[str, ShapePrior],
     grids: Grids,
@@ -204,9 +209,15 @@ def decide(
     """
     every = range(len(grids.occupied))
     found: list[dict[str, np.ndarray]] = [{} for _ in every]
+    # A class with a front matters to the others, whatever the size; an object with the size of no
+    # class is not scored at all.
+    possible = [
+        i for i in every if sizes is None or any(_is_usual(name, sizes[i]) for name in priors)
+    ]
     for name, prior in priors.items():
         if name not in FRONTLESS:
-            for i, own in zip(every, _likelihoods(prior, grids, every, UPRIGHT), strict=True):
+            fronts = _likelihoods(prior, grids, possible, UPRIGHT)
+            for i, own in zip(possible, fronts, strict=True):
                 found[i][name] = own
             continue
         # Nothing else depends on these classes, so that what cannot be of one is not scored.
@@ -270,12 +281,12 @@ def decided(
             or (is_frontless and front_evidence > WITH_FRONT.margin / 2)
             or (size is not None and deviation(name, size, fronts[name]) > UNUSUAL)
         )
-        most = 0.1 if is_excluded else 1.0
+        most = EXCLUDED if is_excluded else 1.0
         likely[name] = min(_sigmoid((margins[name] - standard.margin) / standard.spread), most)
     scores = {name: round(margin, 3) for name, margin in margins.items()}
     possible = [name for name in found if likely[name] > 0.5]
     if not possible:
-        return Decision(None, 0, 1 - max(likely.values(), default=0.0), scores)
+        return Decision(None, 0, 1 - max(likely.values(), default=EXCLUDED), scores)
     best = max(possible, key=lambda name: margins[name])
     return Decision(best, fronts[best], likely[best], scores)
 

@@ -1,7 +1,5 @@
 """Boxes found from points: their parts one by one, then chairs found with the shipped prior."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -25,7 +23,7 @@ from jaxshape.mapping.placement.rays import (
 )
 from jaxshape.model.weights import load_prior
 
-CONFIG = PlacementConfig(yaws=12, overhangs=(0.0, 0.35), kept=4, steps=30, steps_again=10)
+CONFIG = PlacementConfig(yaws=12, overhangs=(0.0, 0.35))
 IMAGE_SIZE = 96
 UNKNOWN = jnp.float32(jnp.nan)
 turn_about_y = jaxlie.SO3.from_y_radians
@@ -156,12 +154,15 @@ def prior():
 
 @pytest.fixture(scope="module")
 def find(prior):
-    """One program for all scenes, with and without a floor and an earlier placement."""
-    place = jax.jit(partial(placing.place, config=CONFIG))
+    """The program of `reconstruct`, with and without a floor and an earlier placement.
+
+    Other settings would be another program, which takes half a minute to compile.
+    """
+    place = jax.jit(placing.place, static_argnums=4)
 
     def find(seen, floor=UNKNOWN, known=None):
         known = placing.nothing_known(prior) if known is None else known
-        return place(prior, seen, jnp.asarray(floor, jnp.float32), known)
+        return place(prior, seen, jnp.asarray(floor, jnp.float32), known, PlacementConfig())
 
     return find
 

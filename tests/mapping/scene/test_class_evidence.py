@@ -10,7 +10,15 @@ from jaxshape.data.chairs import random_chair
 from jaxshape.data.tables import random_table
 from jaxshape.geometry.grids import Grids
 from jaxshape.mapping.scene.boxing import turned_box
-from jaxshape.mapping.scene.classes import UNUSUAL, decide, decided, deviation, unfilled
+from jaxshape.mapping.scene.classes import (
+    EXCLUDED,
+    UNUSUAL,
+    Decision,
+    decide,
+    decided,
+    deviation,
+    unfilled,
+)
 from jaxshape.mapping.scene.evidence import TURNS, hidden_parts, predict_hidden, turned
 
 CLEAR = np.array([-1.4, -1.0, -1.5, -1.4])
@@ -141,3 +149,11 @@ def test_an_object_of_no_usual_size_is_of_no_class():
     assert deviation("chair", strip, 1) > UNUSUAL > 10 * deviation("chair", chair, 0)
     # The box's x is along the front of an object that is turned by a quarter.
     assert deviation("chair", strip, 1) == deviation("chair", strip[::-1], 0)
+
+
+def test_an_object_with_the_size_of_no_class_is_not_scored(priors):
+    """And it is as surely of no class as one that was scored and is excluded."""
+    chair, table = (measured(one) for one in priors.values())
+    sizes = np.array([[0.1, 0.2, 0.1], [1.2, 0.7, 0.8]])
+    small, usual = decide(priors, stacked(chair, table), sizes)
+    assert small == Decision(None, 0, 1 - EXCLUDED, {}) and set(usual.scores) == set(priors)
