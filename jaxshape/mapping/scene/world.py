@@ -42,7 +42,7 @@ LEAST_CELLS = 40
 """Number of cells of the smallest object."""
 
 LONGEST, TALLEST, LEAST_HEIGHT = 2.6, 2.2, 0.1
-"""Greatest extent of an object along the floor, and its greatest and least height, in metres."""
+"""Greatest diagonal of an object on the floor plan, greatest and least height, in metres."""
 
 ABOVE_FLOOR = 0.3
 """Height of a cluster's lowest cell above the floor, in metres, from which it needs a support."""
@@ -348,7 +348,10 @@ def _is_furniture(index: Int[np.ndarray, "n 3"]) -> bool:
 
 def _is_too_large(index: Int[np.ndarray, "n 3"]) -> bool:
     size = (np.ptp(index, axis=0) + 1) * CELL
-    return bool(np.hypot(size[0], size[2]) > LONGEST or size[1] > TALLEST)
+    if size[1] > TALLEST or np.hypot(size[0], size[2]) <= LONGEST:
+        return bool(size[1] > TALLEST)
+    _, sides, _ = rectangle(index[:, [0, 2]].astype(float))  # whichever way it is turned
+    return bool(np.hypot(*(sides + 1)) * CELL > LONGEST)
 
 
 def _stands(index: Int[np.ndarray, "n 3"], floor: float) -> bool:

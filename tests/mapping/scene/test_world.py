@@ -8,7 +8,7 @@ from jaxshape.geometry.camera import intrinsics_of
 from jaxshape.mapping.placement.faces import Cutout
 from jaxshape.mapping.scene.boxing import boxed, turned_box
 from jaxshape.mapping.scene.things import Tracks, associate
-from jaxshape.mapping.scene.world import CELL, Level, cells_of, clusters_of, rectangle
+from jaxshape.mapping.scene.world import CELL, Cells, Level, cells_of, clusters_of, rectangle
 from jaxshape.mapping.segmentation.parts import parts_of
 
 LEVEL = Level(np.eye(4), 0.0)
@@ -65,6 +65,24 @@ def test_what_stands_on_a_table_is_no_part_of_it():
     assert np.abs(bounds(vase) - corners(VASE)).max() < 3 * CELL
     (table,) = [one for one in things if not one.is_on_top]
     assert bounds(table)[1, 1] < 0.74 + 3 * CELL
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 45])
+def test_a_long_bench_is_one_thing_whichever_way_it_is_turned(degrees):
+    """2.4 m are not too long for an object; 3.2 m are, and no part of it is one by itself."""
+
+    def things(length):
+        p = np.random.default_rng(0).uniform(-0.5, 0.5, (60_000, 3)) * [length, 0.8, 0.5]
+        a = np.deg2rad(degrees)
+        p = p @ np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
+        index = np.unique(np.floor((p + [0, 0.42, 0]) / CELL).astype(int), axis=0)
+        always = np.full(len(index), 3)
+        cells = Cells(index, always, 0 * always, np.zeros(len(index), bool))
+        return clusters_of(cells, LEVEL)
+
+    (bench,) = things(2.4)
+    assert 0.98 * 2.4 < np.hypot(*np.ptp(bench.index[:, ::2], axis=0)) * CELL < 2.4 * 1.25
+    assert things(3.2) == []
 
 
 def test_something_that_was_moved_is_noticed():
