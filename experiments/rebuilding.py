@@ -1,5 +1,6 @@
 """Rebuild the object of a recording as `jaxshape reconstruct` does, and judge the result."""
 
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,8 @@ def rebuilt(
     chosen: range | None = None,
 ) -> Progress:
     """Follow a recording to its end and finish its map; `chosen` frames of it, or all."""
-    *_, progress = follow(sequence, start, mapper, placer, use_poses=use_poses, chosen=chosen)
+    steps = follow(sequence, start, mapper, placer, use_poses=use_poses, chosen=chosen)
+    (progress,) = deque(steps, maxlen=1)
     state, shape = mapper.finish(progress.state)
     return progress._replace(state=state, shape=shape)
 

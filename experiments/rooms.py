@@ -14,6 +14,7 @@ Results: experiments/results/rooms.json, room by room, and rooms.png: a killed r
 import json
 import tempfile
 import time
+from collections import deque
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -101,7 +102,7 @@ def one_room(
         record(Path(folder), truth, frames, number)
         sequence = open_sequence(folder)
         began, cpu = time.perf_counter(), time.process_time()
-        *_, scene = follow_scene(sequence, classes, use_poses=True)
+        (scene,) = deque(follow_scene(sequence, classes, use_poses=True), maxlen=1)
         scene = finish_scene(scene, classes)
         seconds = time.perf_counter() - began, time.process_time() - cpu
     matches = matched(truth, scene)
