@@ -62,8 +62,15 @@ class Rebuild:
         """
         from jaxshape.model.weights import load_prior
 
-        packaged = self.weights is None or str(self.weights) == "chair"
-        return load_prior("chair-autoencoder") if packaged else prior
+        is_usual = self.weights is None or str(self.weights) == "chair"
+        return load_prior("chair-autoencoder") if is_usual else prior
+
+    @property
+    def is_of_package(self) -> bool:
+        """Whether the weights are those of the package, for chairs and other seats."""
+        from jaxshape.model.weights import PACKAGED
+
+        return self.weights is None or str(self.weights) in PACKAGED
 
     def method_for(self, prior: Any) -> str:
         """The requested method, or the default of the prior."""

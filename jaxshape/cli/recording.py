@@ -80,6 +80,7 @@ class Reconstruct(Rebuild, Recorded):
         from jaxshape.mapping.map.recording import follow
         from jaxshape.mapping.map.state import grids_of
         from jaxshape.mapping.placement.finding import find_start
+        from jaxshape.mapping.placement.placing import PlacementConfig
         from jaxshape.mapping.segmentation.segment import Prompt, check_prompt
         from jaxshape.model.weights import fingerprint
         from jaxshape.results.checkpoint import load_state, remove_state, save_state
@@ -161,7 +162,10 @@ class Reconstruct(Rebuild, Recorded):
         progress = progress._replace(state=state, shape=shape)
         require_measured(np.asarray(binary(grids_of(state)).occupied))
         figures["seconds"] = round(time.perf_counter() - start, 2)
-        result = write_progress(self.output, sequence, progress, figures, running=False)
+        usual = PlacementConfig().typical_size if self.is_of_package else None
+        result = write_progress(
+            self.output, sequence, progress, figures, running=False, usual=usual
+        )
         self._conclude(progress, result)
         remove_state(self.output)
         if result["verdict"] == "failed":

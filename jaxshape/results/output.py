@@ -52,6 +52,7 @@ class Observation(NamedTuple):
         keyframes: The keyframes that the mesh is judged by; without any it is not judged.
         floor: Height of the floor in the object frame, in metres; NaN where it is not known.
         unseen: Parts of the object that no keyframe saw, or of which the cloud shows nothing.
+        usual: Usual extents of its class `[3]`, in metres; None where they are not known.
         soft: F and M as given to the prior; `occupied` and `occluded` are their rounded values.
             None for binary ones.
         cloud: Points in the object frame that the mesh is judged by where there are no keyframes
@@ -70,6 +71,7 @@ class Observation(NamedTuple):
     keyframes: Sequence[SeenView] = ()
     floor: float = np.nan
     unseen: Unseen = ALL_SEEN
+    usual: tuple[float, float, float] | None = None
     soft: Grids | None = None
     cloud: Float[np.ndarray, "n 3"] | None = None
 
@@ -230,7 +232,7 @@ def _judged(observation: Observation, found: ShapeMesh, is_mirrored: bool) -> di
             floor=observation.floor,
             unseen=observation.unseen,
         )
-    verdict = judged(quality)
+    verdict = judged(quality, observation.usual)
     return {
         "verdict": verdict.word,
         "verdict_reasons": list(verdict.reasons),

@@ -42,6 +42,7 @@ def write_progress(
     figures: dict[str, Any],
     *,
     running: bool,
+    usual: tuple[float, float, float] | None = None,
 ) -> dict[str, Any]:
     """Write all available files of a reconstruction except the checkpoint.
 
@@ -51,6 +52,7 @@ def write_progress(
         progress: Progress of the run.
         figures: Further entries of `result.json`.
         running: Whether the run goes on.
+        usual: Usual extents of the object's class `[3]`, in metres; None where they are not known.
 
     Returns:
         Content of `result.json`.
@@ -64,7 +66,7 @@ def write_progress(
     if not running:
         keyframes, floor = seen_views(progress.state), floor_height(start)
         observation = observation._replace(
-            keyframes=keyframes, floor=floor, unseen=unseen_of(progress)
+            keyframes=keyframes, floor=floor, unseen=unseen_of(progress), usual=usual
         )
     warnings = [*figures.get("warnings", ()), *start.warnings, *doubts_of(progress)]
     result = {**figures, **counts(progress), "notes": start.notes, "warnings": warnings}

@@ -226,6 +226,10 @@ GAP = 0.05
 """Distance between the mesh and the floor, in metres, from which a part of the object is missing or
 too much."""
 
+ODD = 0.4, 2.6
+"""Least and greatest size of an object, relative to the usual size of its class: the geometric mean
+of the three ratios. A stool for children has 0.5, a sofa for three 2.2."""
+
 SIZES = (0.05, 4.0)
 """Shortest and longest length of the longest side of an object in a room, in metres."""
 
@@ -240,15 +244,17 @@ doubtful; from the second on, too little was seen, for example only the back of 
 table."""
 
 
-def judged(quality: Quality) -> Verdict:
+def judged(quality: Quality, usual: tuple[float, float, float] | None = None) -> Verdict:
     """A verdict by fixed thresholds.
 
     Args:
         quality: Figures of a result.
+        usual: Usual extents of its class along x, y and z, in metres; None where they are not
+            known.
     """
     if failures := tuple(_failures(quality)):
         return Verdict("failed", failures)
-    doubts = tuple(_doubts(quality))
+    doubts = (*_doubts(quality), *(_odd_size(quality, usual) if usual else ()))
     return Verdict("doubtful" if doubts else "good", doubts)
 
 
@@ -281,12 +287,24 @@ def _doubts(q: Quality) -> Iterator[str]:
         yield f"its lower {q.unseen_below:.0%}, for example the legs, is predicted"
 
 
+def _odd_size(q: Quality, usual: tuple[float, float, float]) -> Iterator[str]:
+    times = float(np.exp(np.mean(np.log(q.size) - np.log(usual))))
+    if not ODD[0] <= times <= ODD[1]:
+        yield (
+            f"it is {times:.2g} times as large as objects of its class usually are: the depth "
+            "scale may be wrong (--depth-scale)"
+        )
+
+
 def _contradictions(q: Quality, explained: float, free_violated: float) -> Iterator[str]:
     """What mesh and measurement disagree about, from these shares on."""
     if q.explained < explained:
         yield f"the mesh explains only {q.explained:.0%} of the measured points of the object"
     if q.free_violated > free_violated:
-        yield f"{q.free_violated:.0%} of the mesh lies in space that was measured as free"
+        yield (
+            f"{q.free_violated:.0%} of the mesh lies in space that was measured as free: some "
+            "poses or the focal length are wrong, or the object was moved"
+        )
 
 
 def _unseen_sides(q: Quality) -> tuple[str, ...]:

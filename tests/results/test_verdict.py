@@ -142,6 +142,18 @@ def test_a_completed_cloud_is_judged_by_its_points():
     assert judged(away).word != "good"
 
 
+def test_a_size_that_no_object_of_its_class_has_is_doubted():
+    """Depth in millimetres that is read with 5000 units a metre makes a chair of 19 cm."""
+    chair = (0.58, 0.86, 0.60)
+    small = GOOD._replace(size=(0.12, 0.19, 0.12))
+    assert "0.21 times as large" in judged(small, chair).sentence
+    assert "--depth-scale" in judged(small, chair).sentence
+    assert judged(GOOD._replace(size=(2.9, 4.0, 3.0)), chair).word == "doubtful"
+    for size in [(2.0, 0.9, 1.1), (0.3, 0.45, 0.3), (2.4, 0.8, 0.5), (0.4, 0.75, 0.4)]:
+        assert judged(GOOD._replace(size=size), chair).word == "good"
+    assert judged(small).word == "good"  # of a class whose sizes are not known
+
+
 def test_a_good_result_has_no_reasons():
     assert judged(GOOD) == ("good", ()) and judged(GOOD).sentence == "good"
 
@@ -155,7 +167,8 @@ def test_a_good_result_has_no_reasons():
         (
             {"free_violated": 0.2},
             "doubtful",
-            "20% of the mesh lies in space that was measured as free",
+            "20% of the mesh lies in space that was measured as free: some poses or the focal "
+            "length are wrong, or the object was moved",
         ),
         ({"free_violated": 0.5}, "failed", "50% of the mesh lie"),
         ({"floor_gap": 0.21}, "doubtful", "21 cm above the floor"),

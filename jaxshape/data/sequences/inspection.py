@@ -26,6 +26,7 @@ from jaxshape.data.sequences.frames import (
     likely_depth_scales,
 )
 from jaxshape.data.sequences.hypotheses import FITS, Reading, reading_of
+from jaxshape.data.sequences.poses import NEAR, READABLE_GAP
 
 _USUAL_DEPTHS = (0.3, 7.0)  # metres, of the median; outside, a scale is doubted, not refused
 _SLOW = 0.2  # depth images per second; below, times are hardly in seconds
@@ -301,7 +302,8 @@ def _of_missing(poses: Poses | None, count: int) -> Iterator[Finding]:
     if without := count - poses.known - len(poses.damaged):
         yield Finding(
             f"{without} of {count} frames have no pose",
-            "They can be tracked, but cannot be fused as they are.",
+            f"They are tracked. In lists with times, a pose counts up to {NEAR:g} s from the "
+            f"frame, and is interpolated between two poses up to {READABLE_GAP:g} s apart.",
         )
 
 

@@ -9,6 +9,9 @@ from jaxshape.mapping.segmentation.planes import floor_plane
 Doubt = tuple[float, str]
 """Evidence from 0, against the segmentation, to 1, for it; and the doubt it raises, in words."""
 
+_ALL_AROUND = np.array([x for x in np.ndindex(3, 3, 3) if x > (1, 1, 1)]) - 1.0
+_ALL_AROUND /= np.linalg.norm(_ALL_AROUND, axis=1, keepdims=True)  # 13 directions, signs aside
+
 
 def doubts_of(
     segmented: Bool[np.ndarray, "h w"],
@@ -28,7 +31,7 @@ def doubts_of(
         clicked: Whether the user clicked on the object.
     """
     hidden, touching = _outline(segmented, behind, view)
-    size = float(np.linalg.norm(np.ptp(view.points[segmented], axis=0)))
+    size = float(np.ptp(view.points[segmented] @ _ALL_AROUND.T, axis=0).max())
     return [
         (1 - falling(segmented.mean(), 0.0, 0.01), "it covers hardly any of the image"),
         (falling(cut(segmented), 0.1, 0.6), "the border of the image cuts it"),

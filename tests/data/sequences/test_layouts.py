@@ -530,7 +530,7 @@ def test_ten_thousand_frames_open_at_once_and_unread(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "damage, said",
     [
-        (lambda f: (f / "depth.txt").write_text("1.0\n"), "is not a list of images"),
+        (lambda f: (f / "depth.txt").write_text("1.0 a.png\n2.0\n"), "line 2 has no file: '2.0'"),
         (lambda f: (f / "depth.txt").write_text("# none\n"), "lists no image"),
         (lambda f: (f / "depth.txt").write_text("1.0 gone.png\n"), "cannot be read as an image"),
         (lambda f: (f / "groundtruth.txt").write_text("1 2 3\n"), "cannot be read as a traj"),

@@ -58,6 +58,20 @@ def test_a_click_selects_what_is_under_it(seen, group):
     assert iou(found.segmented, seen.label == group) > 0.85
 
 
+@pytest.mark.parametrize("eye", [(0.2, 1.6, 2.4), (1.7, 1.6, 1.7)])
+def test_a_sofa_is_as_large_from_every_side(eye):
+    sofa = [
+        ((-1, 0, -0.5), (1, 0.42, 0.5)),
+        ((-1, 0.42, -0.5), (1, 0.9, -0.25)),
+        ((-1, 0.42, -0.5), (-0.85, 0.6, 0.5)),
+        ((0.85, 0.42, -0.5), (1, 0.6, 0.5)),
+    ]
+    seen = room([FLOOR, WALLS, sofa], eye)
+    found = segment(seen.depth, None, K, Prompt(click=middle_of(seen.label == 2)))
+    assert iou(found.segmented, seen.label == 2) > 0.85
+    assert found.confidence > 0.3
+
+
 def test_a_table_top_is_segmented_only_if_it_is_clicked(seen):
     top = (seen.label == 4) & (_height(seen) > 0.71)
     assert segment(seen.depth, None, K).segmented[top].mean() < 0.05

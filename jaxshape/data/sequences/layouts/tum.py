@@ -74,9 +74,8 @@ def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
     is read.
     """
     try:
-        words = [line.split(maxsplit=1) for line in reading.read_text(path).splitlines()]
-        words = [w for w in words if w and not w[0].startswith("#")]
-        pairs = [(float(time), _ASSOCIATED.sub(r"\1", file.strip())) for time, file in words]
+        lines = enumerate(map(str.strip, reading.read_text(path).splitlines()), 1)
+        pairs = [_listed(line, i) for i, line in lines if line and not line.startswith("#")]
         if not np.isfinite([time for time, _ in pairs]).all():
             raise ValueError("a time is not finite")
     except (OSError, ValueError, IndexError) as error:
@@ -89,6 +88,14 @@ def _read_list(path: Path) -> tuple[Float[np.ndarray, " n"], list[Path]]:
     return np.array([time for time, _ in pairs]), [
         below(path.parent, file, path) for _, file in pairs
     ]
+
+
+def _listed(line: str, number: int) -> tuple[float, str]:
+    """The time and the file of a line."""
+    time, *file = line.split(maxsplit=1)
+    if not file:
+        raise ValueError(f"line {number} has no file: {line[:40]!r}")
+    return float(time), _ASSOCIATED.sub(r"\1", file[0])
 
 
 def _unlisted(depth: list[Path]) -> tuple[Finding, ...]:
@@ -113,9 +120,9 @@ def check_rising(times: Float[np.ndarray, " n"], path: Path) -> None:
     if len(still) > 0.1 * len(times):
         first = times[still[0]], times[still[0] + 1]
         raise SequenceError(
-            f"{path} has {len(still)} times that do not rise, {first[0]:g} and then {first[1]:g} "
-            "among them; expected increasing seconds since one start, not intervals between "
-            "frames: write their sums."
+            f"{path} has {len(still)} times that do not rise, {first[0]:.3f} and then "
+            f"{first[1]:.3f} among them; expected increasing seconds since one start, not "
+            "intervals between frames: write their sums, or sort the lines."
         )
 
 
