@@ -164,6 +164,7 @@ def test_a_good_result_has_no_reasons():
         ({"explained": 0.7}, "doubtful", "explains only 70%"),
         ({"explained": 0.3}, "failed", "explains only 30%"),
         ({"measured": 0.05}, "doubtful", "only 5% of the mesh was measured"),
+        ({"predicted": 0.72}, "doubtful", "72% of the mesh is predicted"),
         (
             {"free_violated": 0.2},
             "doubtful",
