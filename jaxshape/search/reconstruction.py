@@ -368,10 +368,16 @@ def require_batch(grids: Grids) -> None:
         )
     require_rows(shapes[0][0])
     for name, grid in zip(("occupied", "occluded"), grids[:2], strict=True):
-        if not is_traced(grid) and not bool(jnp.all(abs(grid - 0.5) < 0.501)):  # 0 to 1, rounded
+        if not is_traced(grid) and not _are_probabilities(grid):
             raise ValueError(
                 f"{name} holds NaN or values outside 0 to 1; give booleans, or probabilities."
             )
+
+
+def _are_probabilities(grid: Array | np.ndarray) -> bool:
+    """Whether all values are from 0 to 1, up to rounding; also where a trace closes over them."""
+    with jax.ensure_compile_time_eval():
+        return bool(jnp.all(abs(jnp.asarray(grid, jnp.float32) - 0.5) < 0.501))
 
 
 def all_measured(occupied: Bool[Array | np.ndarray, "*batch x y z"]) -> bool:

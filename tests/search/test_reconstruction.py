@@ -268,6 +268,15 @@ def test_grids_that_do_not_fit_are_named(linear_prior, unchecked_types, occupied
         reconstruct(KEY, linear_prior, occupied, occluded, None, CONFIG)
 
 
+def test_a_trace_may_close_over_grids_of_any_type(linear_prior):
+    """In bfloat16, 0.501 would be rounded to 0.5, and no 1 would be a probability."""
+    F, M = OCCUPIED.astype(jnp.bfloat16), OCCLUDED.astype(jnp.bfloat16)
+    config = RefineConfig(iterations=1)
+    twice = jax.jit(lambda x: x * reconstruct(KEY, linear_prior, F, M, None, config).objective)
+    alone = reconstruct(KEY, linear_prior, OCCUPIED, OCCLUDED, None, config).objective
+    np.testing.assert_allclose(twice(2.0), 2 * alone, rtol=1e-5)
+
+
 def test_a_singular_covariance_still_leaves_a_space_to_search_in(linear_prior):
     """Codes of a training set may leave out directions; they used to end in NaN."""
     singular = linear_prior._replace(code_covariance=jnp.diag(jnp.arange(10.0)))
