@@ -209,11 +209,12 @@ def decide(
     """
     every = range(len(grids.occupied))
     found: list[dict[str, np.ndarray]] = [{} for _ in every]
+    usual = {
+        name: [i for i in every if sizes is None or _is_usual(name, sizes[i])] for name in priors
+    }
     # A class with a front matters to the others, whatever the size; an object with the size of no
     # class is not scored at all.
-    possible = [
-        i for i in every if sizes is None or any(_is_usual(name, sizes[i]) for name in priors)
-    ]
+    possible = sorted(set().union(*usual.values()))
     for name, prior in priors.items():
         if name not in FRONTLESS:
             fronts = _likelihoods(prior, grids, possible, UPRIGHT)
@@ -221,12 +222,11 @@ def decide(
                 found[i][name] = own
             continue
         # Nothing else depends on these classes, so that what cannot be of one is not scored.
-        usual = [i for i in every if sizes is None or _is_usual(name, sizes[i])]
-        upright = _likelihoods(prior, grids, usual, UPRIGHT)
+        upright = _likelihoods(prior, grids, usual[name], UPRIGHT)
         likely = [k for k, own in enumerate(upright) if own.max() >= WITHOUT_FRONT.likelihood]
-        toppled = _likelihoods(prior, grids, [usual[k] for k in likely], TOPPLED)
+        toppled = _likelihoods(prior, grids, [usual[name][k] for k in likely], TOPPLED)
         for k, own in zip(likely, toppled, strict=True):
-            found[usual[k]][name] = np.concatenate([upright[k], own])
+            found[usual[name][k]][name] = np.concatenate([upright[k], own])
     return [decided(found[i], None if sizes is None else sizes[i]) for i in every]
 
 

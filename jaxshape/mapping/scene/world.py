@@ -348,8 +348,10 @@ def _is_furniture(index: Int[np.ndarray, "n 3"]) -> bool:
 
 def _is_too_large(index: Int[np.ndarray, "n 3"]) -> bool:
     size = (np.ptp(index, axis=0) + 1) * CELL
-    if size[1] > TALLEST or np.hypot(size[0], size[2]) <= LONGEST:
-        return bool(size[1] > TALLEST)
+    if size[1] > TALLEST:
+        return True
+    if np.hypot(size[0], size[2]) <= LONGEST:
+        return False
     _, sides, _ = rectangle(index[:, [0, 2]].astype(float))  # whichever way it is turned
     return bool(np.hypot(*(sides + 1)) * CELL > LONGEST)
 
